@@ -202,8 +202,8 @@ def _choices_with(key: str, groups: Sequence[str]) -> list[str]:
     package = f"@{node}" if "." in node else ""
     choices = []
     for file in sorted(conf_dir().joinpath(group).glob("*.yaml")):
-        content = OmegaConf.load(file) or {}
-        if name in content:
+        content = OmegaConf.load(file)
+        if content and name in content:
             choices.append(f"{group}{package}={file.stem}")
     return choices
 

@@ -67,25 +67,25 @@ def _nested_readouts(
     """
     generated = outputs[max(outputs)].points
     rows = match(generated, points)
-    samples = {}
+    by_size = {}
     for m, output in outputs.items():
-        samples[m] = _chosen(points, output.points, rows[:, :m])
+        by_size[m] = _readouts_of(points, output.points, rows[:, :m])
     if sampler.projects:
         projected = sampler.project(generated, points)
-        for m, sets in samples.items():
+        for m, sets in by_size.items():
             sets[PROJECTED] = projected[:, :m]
-    return samples
+    return by_size
 
 
 def _generated_readouts(points: Tensor, generated: Tensor, sampler: Sampler) -> dict[str, Tensor]:
     """Return the readouts of one sample ``(B, m, 3)``."""
-    sets = _chosen(points, generated, match(generated, points))
+    sets = _readouts_of(points, generated, match(generated, points))
     if sampler.projects:
         sets[PROJECTED] = sampler.project(generated, points)
     return sets
 
 
-def _chosen(points: Tensor, generated: Tensor, rows: Tensor) -> dict[str, Tensor]:
+def _readouts_of(points: Tensor, generated: Tensor, rows: Tensor) -> dict[str, Tensor]:
     """Return the generated points, and the matched and completed ones.
 
     Args:

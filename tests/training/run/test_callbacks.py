@@ -88,7 +88,7 @@ def test_pictures_are_drawn_ten_times_in_a_training_of_twenty_epochs(length, tmp
             drawn.append(trainer.current_epoch)
         return _Drawn({}, torch.zeros(1, 1, 3), {}, [])
 
-    monkeypatch.setattr(CloudVisualization, "_drawn", note)
+    monkeypatch.setattr(CloudVisualization, "_draw", note)
 
     job(tmp_path / "run", "weights=null", "pictures=1", "logger=tensorboard", *length)
 

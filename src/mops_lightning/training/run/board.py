@@ -20,8 +20,11 @@ from mops_lightning.viz.figures import COLOURS, INPUT_COLOUR, thinned
 ORDER = (*GENERATED_READOUTS, PROJECTED, INDEX_READOUT, FULL)
 """Readouts in the order of their curves."""
 
-OTHERS = {"train/mean_loss": "7 train loss", "train/tau": "8 tau"}
-"""Further curves of the first screen, after those of the readouts."""
+OTHERS = {
+    "train/mean_loss": "7 train loss",
+    "train/tau": "8 tau",
+}
+"""Further curves of the first screen. TensorBoard sorts by name: the numbers put these last."""
 
 ALWAYS_SHOWN = ("m", "seed", "learn", "batch_size", "optimizer.lr", "trainer.max_epochs")
 """Settings of the HPARAMS table beside the groups' names and what the user has changed."""
@@ -104,12 +107,12 @@ class Board(TensorBoardLogger):
         cloud = thinned(points.detach().cpu().float())
         grey = torch.tensor(INPUT_COLOUR).expand(cloud.shape)
         for name, sample in samples.items():
-            own = sample.detach().cpu().float()
+            sampled = sample.detach().cpu().float()
             rgb = COLOURS.get(name, COLOURS["sampled"])
-            colour = torch.tensor(rgb).expand(own.shape)
+            colour = torch.tensor(rgb).expand(sampled.shape)
             self.experiment.add_mesh(
                 f"clouds/{name}",
-                torch.cat([cloud, own], dim=1),
+                torch.cat([cloud, sampled], dim=1),
                 torch.cat([grey, colour], dim=1),
                 config_dict={"material": {"cls": "PointsMaterial", "size": 0.03}},
                 global_step=step,
@@ -125,15 +128,17 @@ def curve_name(name: str, score: str) -> str:
     """
     if name in OTHERS:
         return f"curves/{OTHERS[name]}"
-    parts = re.fullmatch(rf"val/(?:(m\d+)/)?(\w+)/{re.escape(score)}", name)
-    if parts is None:
+    match = re.fullmatch(rf"val/(?:(m\d+)/)?(\w+)/{re.escape(score)}", name)
+    if match is None:
         return name
-    size, readout = parts.groups()
+    size, readout = match.groups()
     if readout not in ORDER:
         return name
-    place = 1 + ORDER.index(readout)
-    curve = f"curves/{place} val {score}, {readout}"
-    return f"{curve}, {size}" if size else curve
+    number = 1 + ORDER.index(readout)
+    curve = f"curves/{number} val {score}, {readout}"
+    if size:
+        curve += f", {size}"
+    return curve
 
 
 def board_settings(record: RunRecord) -> dict[str, Any]:
@@ -150,4 +155,6 @@ def board_settings(record: RunRecord) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> int | float | str:
-    return value if isinstance(value, int | float | str) else str(value)
+    if isinstance(value, int | float | str):
+        return value
+    return str(value)

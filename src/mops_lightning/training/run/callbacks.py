@@ -127,7 +127,7 @@ def build_callbacks(nodes: DictConfig, offered: dict[str, Any], logged: bool) ->
         has_nothing_to_draw = name == "pictures" and "batch" not in offered
         if node is None or has_nothing_to_log or has_nothing_to_draw:
             continue
-        where = f"callbacks.{name}"
+        where = f"callbacks.{name!s}"
         if "_target_" not in node:
             raise UserError(f"{where}: give its class as {where}._target_=MODULE.CLASS.")
         callbacks.append(build_as(Callback, node, where, offered))

@@ -29,13 +29,13 @@ class StopBetweenSteps(Callback):
 
     def __init__(self, checkpoint: Path | None) -> None:
         self.checkpoint = checkpoint
-        self.received: int | None = None
-        self.leads = True
+        self.received: int | None = None  # number of the first signal
+        self.prints = True
         self._before: dict[int, Any] = {}
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Install the signal handlers, after Lightning has set its own."""
-        self.leads = trainer.is_global_zero
+        self.prints = trainer.is_global_zero
         for number in (signal.SIGINT, signal.SIGTERM):
             self._before[number] = signal.signal(number, self._note)
 
@@ -43,7 +43,7 @@ class StopBetweenSteps(Callback):
         if self.received is not None:
             raise KeyboardInterrupt("Stopped at once; the last complete checkpoint is kept.")
         self.received = number
-        if self.leads:
+        if self.prints:
             print("Stopping after this step (once more: at once) ...", file=sys.stderr, flush=True)
 
     def on_train_batch_end(
@@ -51,8 +51,9 @@ class StopBetweenSteps(Callback):
     ) -> None:
         """Stop if a signal came, all processes of a run after the same optimizer step."""
         batches = batch_idx + 1
-        stepped = batches % trainer.accumulate_grad_batches == 0
-        if stepped and batches < trainer.num_training_batches:
+        is_after_step = batches % trainer.accumulate_grad_batches == 0
+        is_last = batches >= trainer.num_training_batches
+        if is_after_step and not is_last:
             self._stop_if_asked(trainer, save=True)
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
@@ -65,12 +66,14 @@ class StopBetweenSteps(Callback):
         self._stop_if_asked(trainer, save=False)
 
     def _stop_if_asked(self, trainer: L.Trainer, save: bool) -> None:
-        if trainer.strategy.reduce_boolean_decision(self.received is not None, all=False):
-            if self.checkpoint is None:
-                raise Interrupted("No checkpoint was written.")
-            if save:
-                trainer.save_checkpoint(self.checkpoint)
-            raise Interrupted(f"Resume with the same command and ckpt_path={self.checkpoint}")
+        is_asked = trainer.strategy.reduce_boolean_decision(self.received is not None, all=False)
+        if not is_asked:
+            return
+        if self.checkpoint is None:
+            raise Interrupted("No checkpoint was written.")
+        if save:
+            trainer.save_checkpoint(self.checkpoint)
+        raise Interrupted(f"Resume with the same command and ckpt_path={self.checkpoint}")
 
     def on_exception(self, trainer: L.Trainer, *args: Any) -> None:
         """Restore the signal handlers."""
@@ -104,7 +107,7 @@ class KeepsEnding(Callback):
         self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]
     ) -> None:
         """Add the state to a checkpoint."""
-        ending = Ending(bool(trainer.should_stop), validation_of(trainer) or self._validation)
+        ending = Ending(bool(trainer.should_stop), self.validation(trainer))
         checkpoint[ENDING] = ending.plain()
 
     def on_load_checkpoint(
@@ -120,20 +123,13 @@ class KeepsEnding(Callback):
 
     def validation(self, trainer: L.Trainer) -> dict[str, float]:
         """Return the metrics of the last validation, which may have been before a stop."""
-        return validation_of(trainer) or self._validation
-
-    @property
-    def _validation(self) -> dict[str, float]:
-        return {} if self.restored is None else self.restored.validation
-
-
-def validation_of(trainer: L.Trainer) -> dict[str, float]:
-    """Return the metrics of a trainer's last validation, by name."""
-    return {
-        name: float(value)
-        for name, value in trainer.callback_metrics.items()
-        if name.startswith("val/")
-    }
+        validation = {}
+        for name, value in trainer.callback_metrics.items():
+            if name.startswith("val/"):
+                validation[name] = float(value)
+        if validation or self.restored is None:
+            return validation
+        return self.restored.validation
 
 
 @contextmanager

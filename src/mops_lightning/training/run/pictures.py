@@ -75,7 +75,7 @@ class CloudVisualization(Callback):
         board = _board(trainer)
         if board is None or trainer.current_epoch % every != 0:
             return
-        drawn = self._drawn(trainer, pl_module, scores=None)
+        drawn = self._draw(trainer, pl_module, scores=None)
         for name, figure in drawn.figures.items():
             drawing.view_upright(figure, self.up)
             board.experiment.add_figure(_tag(name), figure, trainer.global_step)
@@ -85,7 +85,7 @@ class CloudVisualization(Callback):
         if not trainer.is_global_zero:
             return
         board = _board(trainer)
-        drawn = self._drawn(trainer, pl_module, scores=trainer.callback_metrics)
+        drawn = self._draw(trainer, pl_module, scores=trainer.callback_metrics)
         if drawn.samples:
             path = self.folder / drawing.CLOUDS
             points = drawing.to_y_up(drawn.points, self.up)
@@ -104,7 +104,7 @@ class CloudVisualization(Callback):
                 board.experiment.add_image(_tag(name), pixels, step, dataformats="HWC")
 
     @torch.no_grad()
-    def _drawn(
+    def _draw(
         self, trainer: L.Trainer, module: Any, scores: Mapping[str, Tensor] | None
     ) -> "_Drawn":
         """Draw the clouds with the nets as they are.
@@ -149,11 +149,11 @@ class CloudVisualization(Callback):
         figures = figures_of(module.task, batch, {**methods, **samples}, self.titles)
         figures["clouds"] = drawing.cloud_grid(points, samples, titles, self.channel)
         points = coordinates(points)
-        samples = {name: coordinates(chosen) for name, chosen in samples.items()}
+        samples = {name: coordinates(sample) for name, sample in samples.items()}
         if scores is not None:
-            main = {name: coordinates(chosen) for name, chosen in methods.items()}
-            main[module.main_readout] = samples[module.main_readout]
-            figures["comparison"] = self._comparison(module, points, main, scores)
+            compared = {name: coordinates(sample) for name, sample in methods.items()}
+            compared[module.main_readout] = samples[module.main_readout]
+            figures["comparison"] = self._comparison(module, points, compared, scores)
         matrix = output.matrix
         if matrix is not None and points.shape[1] * matrix.m <= DENSE_PIXELS:
             first = matrix.first_cloud()
@@ -168,7 +168,7 @@ class CloudVisualization(Callback):
         scores: Mapping[str, Tensor],
     ) -> Figure:
         """Draw one cloud with the sample of each method, under the method's test score."""
-        shown = (len(self.titles) - 1) // 2
+        cloud = (len(self.titles) - 1) // 2
         info = MetricInfo.of(module.task.score, module.task.metrics()[module.task.score])
         labels = {module.main_readout: type(module.sampler).__name__, FULL: "all points"}
         captions = {}
@@ -178,12 +178,12 @@ class CloudVisualization(Callback):
             score = scores.get(f"test/{prefix}{name}/{info.name}")
             if score is not None:
                 captions[name] += f": {info.format(float(score))} {info.unit}"
-        drawn = {name: chosen[shown] for name, chosen in samples.items()}
-        return drawing.comparison(points[shown], drawn, captions)
+        drawn = {name: sample[cloud] for name, sample in samples.items()}
+        return drawing.comparison(points[cloud], drawn, captions)
 
 
 class _Drawn(NamedTuple):
-    """What was drawn.
+    """Figures, and the clouds that they show.
 
     Attributes:
         figures: by name.
@@ -234,22 +234,22 @@ def clouds_to_draw(dataset: CloudDataset, number: int) -> tuple[Tensor, list[str
     """
     labels = dataset.test.labels
     classes = len(dataset.class_names)
-    wanted = _spread(classes, max(number, 1))
-    present = [label for label in wanted.tolist() if label in labels][:number]
+    candidates = _spread(classes, max(number, 1))
+    present = [label for label in candidates.tolist() if label in labels][:number]
     rows: list[int] = []
     titles: list[str] = []
-    for place, label in enumerate(present):
+    for position, label in enumerate(present):
         share = number // len(present)
-        if place < number % len(present):
+        if position < number % len(present):
             share += 1
         members = (labels == label).nonzero()[:, 0]
-        chosen = members[_spread(len(members), share)].tolist()
-        rows += chosen
+        rows_of_class = members[_spread(len(members), share)].tolist()
+        rows += rows_of_class
         name = dataset.class_names[label]
-        if len(chosen) == 1:
+        if len(rows_of_class) == 1:
             titles.append(name)
         else:
-            titles += [f"{name} {count}" for count in range(1, len(chosen) + 1)]
+            titles += [f"{name} {count}" for count in range(1, len(rows_of_class) + 1)]
     return torch.tensor(rows, dtype=torch.int64), titles
 
 

@@ -49,7 +49,13 @@ def run(cfg: DictConfig, folder: Path, overrides: list[str] | None = None) -> Ru
 
 
 def run_in(folder: Path, cfg: DictConfig, overrides: list[str]) -> RunRecord:
-    """Do the same with settings that are ``checked``, in a folder that is claimed (``claim``)."""
+    """Do as ``run`` does, with settings that are ``checked`` and a folder that is claimed.
+
+    Args:
+        folder: the run's folder, after ``claim``.
+        cfg: the settings, as ``checked`` returned them.
+        overrides: what the user changed, for the record.
+    """
     trained = TrainedRun.read(cfg.evaluate) if cfg.evaluate else None
     writes = not distributed.is_worker_rank(cfg)
     settings: Any = OmegaConf.to_container(cfg, resolve=True)
