@@ -1,4 +1,4 @@
-"""What the declaration of a setting says: its effect, its trainings, its place in evaluations."""
+"""The declaration of a setting: its effect, its trainings, whether an evaluation may change it."""
 
 from dataclasses import dataclass
 from enum import Enum, Flag, auto

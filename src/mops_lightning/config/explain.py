@@ -27,7 +27,7 @@ NOT_IN_STRUCT = re.compile(r"is not in struct\s+full_key: (\S+)")
 UNKNOWN_IN_FILE = re.compile(r"In '(.+)': ConfigKeyError .*\nKey '(\w+)' not in 'Run")
 UNREAD = re.compile(r"Lexer\w+: (.*)")
 REMOVED = re.compile(r"Key '(\w+)' not in 'RunSettings'")
-"""What Hydra and OmegaConf say about mistakes, with the names in it."""
+"""Messages of Hydra and OmegaConf about mistakes, with the names in them."""
 
 
 def explain(error: BaseException, arguments: Sequence[str]) -> str:

@@ -244,7 +244,7 @@ _STAYS = {"evaluation": InEvaluation.STAYS}
 _FOR_NEW_NET = {"evaluation": InEvaluation.FOR_NEW_NET}
 _OF_SAMPLED_POINTS = {"serves": Training.JOINT | Training.SAMPLER}
 _OF_STAGES = {**_NOTHING, **_STAYS, "learn": ()}
-"""What several settings inside groups have in common."""
+"""Declarations that several settings inside groups share."""
 
 HOW_IT_RUNS = (
     "_target_",

@@ -21,7 +21,7 @@ CHECKPOINT_KEY = "mops_lightning"
 """Key of the run's identity in a checkpoint."""
 
 ENDING = "mops_lightning_ending"
-"""Key of what a checkpoint knows of the end of its training."""
+"""Key of the ``Ending`` in a checkpoint."""
 
 LENGTH = "trainer.max_epochs"
 """The planned length of a run."""
@@ -70,7 +70,7 @@ class Checkpoint:
         planned: epochs for which this run was planned.
         done: epochs that it had trained.
         steps: optimizer steps that it had trained.
-        ending: whether something ended its training before ``planned``.
+        ending: whether its training was told to stop before ``planned``.
     """
 
     path: Path
@@ -102,7 +102,7 @@ class Checkpoint:
 
 @dataclass(frozen=True)
 class Ending:
-    """What a checkpoint knows of the end of its training.
+    """How the training that wrote a checkpoint was about to end.
 
     Attributes:
         should_stop: whether a callback or a limit had told the trainer to stop.

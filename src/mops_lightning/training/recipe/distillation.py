@@ -16,7 +16,7 @@ from mops_lightning.types import Batch, PointFeatureNet
 
 @dataclass(frozen=True)
 class Targets:
-    """What the samples of a step are compared with.
+    """The targets of distillation in one step: samples are compared with them.
 
     Attributes:
         prediction: the first task net's for all points; None if it is not compared.

@@ -14,7 +14,7 @@ from mops_lightning.config.build import build
 
 @dataclass(frozen=True)
 class OptimizerMakers:
-    """How a node of settings makes an optimizer.
+    """Functions that make the optimizer and the schedule that a node of settings describes.
 
     Attributes:
         optimizer: from parameters or their groups to the optimizer.
@@ -33,11 +33,12 @@ class OptimizerMakers:
             where: the node's place in the configuration, for errors.
         """
         arguments: Any = OmegaConf.to_container(node, resolve=True)
-        of_schedule = arguments.pop("schedule", None)
+        schedule_arguments = arguments.pop("schedule", None)
+        schedule = None
         optimizer = _maker(arguments, where)
-        if not of_schedule:
-            return cls(optimizer, None)
-        return cls(optimizer, _maker(of_schedule, f"{where}.schedule"))
+        if schedule_arguments:
+            schedule = _maker(schedule_arguments, f"{where}.schedule")
+        return cls(optimizer, schedule)
 
     def check(self) -> None:
         """Make an optimizer of one parameter, so that mistakes end the run before any training.
@@ -58,7 +59,7 @@ def _maker(arguments: dict[str, Any], where: str) -> Callable[..., Any]:
 
 
 def check_optimizers(cfg: DictConfig) -> None:
-    """Check the optimizers that a run may use, also one that the cache of task nets spares it.
+    """Check the optimizers of a run, also the task net's if its weights are cached.
 
     Raises:
         UserError: an argument of ``optimizer`` or ``pretrain`` is wrong.

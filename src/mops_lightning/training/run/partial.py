@@ -1,4 +1,4 @@
-"""What a run left out, for its record: reports keep such a run out of their tables."""
+"""Notes on shortened training or tests, in the record: reports leave such runs out of tables."""
 
 import math
 from collections.abc import Mapping
