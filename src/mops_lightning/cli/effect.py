@@ -49,8 +49,9 @@ def _has_one_of(trainings: Training, cfg: DictConfig) -> bool:
         return True
     if Training.JOINT in trainings and cfg.learn == "joint":
         return True
-    may_train_sampler = Training.SAMPLER in trainings and cfg.learn != "task"
-    return may_train_sampler and _sampler_is_learned(cfg.sampler)
+    if Training.SAMPLER in trainings and cfg.learn != "task":
+        return _sampler_is_learned(cfg.sampler)
+    return False
 
 
 def _sampler_is_learned(node: DictConfig) -> bool:

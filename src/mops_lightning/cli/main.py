@@ -6,6 +6,7 @@ Nothing heavy is imported before the command is known, so that ``--help`` is qui
 import os
 import re
 import sys
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
@@ -51,8 +52,8 @@ def main() -> None:
 
             print(help.text())
         elif first in COMMANDS:
-            module, _, function = COMMANDS[first].rpartition(".")
-            getattr(import_module(module), function)(arguments[1:], f"{program()} {first}")
+            subcommand = _function(COMMANDS[first])
+            subcommand(arguments[1:], f"{program()} {first}")
         elif WORD.fullmatch(first):
             hint = did_you_mean(first, COMMANDS)
             end(
@@ -64,6 +65,13 @@ def main() -> None:
             from mops_lightning.cli import train
 
             train.main()
+
+
+def _function(path: str) -> Callable[[list[str], str], None]:
+    """Import the function that a dotted path names."""
+    module, _, name = path.rpartition(".")
+    function: Callable[[list[str], str], None] = getattr(import_module(module), name)
+    return function
 
 
 def program() -> str:

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 MOST_VALUES = 1e5
 """Most values of one range in a sweep."""
 
+NOT_VERBOSE = (int, float, dict, type(None))
+"""Types of values of ``hydra.verbose`` that Hydra would fail on."""
+
 OTHERWISE = {
     "logger": " (logger=none for none)",
     "callbacks": " or leave single callbacks out with callbacks.NAME=null",
@@ -52,7 +55,7 @@ def _check(argument: str, name: str, override: "Override", groups: list[str]) ->
         _check_range(argument, value)
     if override.is_delete():
         _check_removal(argument, name, value, groups)
-    elif name == "hydra.verbose" and type(value) in (int, float, dict, type(None)):
+    elif name == "hydra.verbose" and type(value) in NOT_VERBOSE:
         raise UserError(f"{argument}: give true, false, or a list of loggers.")
     elif _chooses(name, value, groups):
         _check_choices(argument, name, override)
@@ -119,5 +122,7 @@ def _is_choice(value: Any, group: str) -> bool:
     """Return whether a value is a choice of a group: a name, or settings of a top-level object."""
     from hydra.core.override_parser.types import QuotedString
 
-    is_settings = isinstance(value, dict) and bool(value) and "/" not in group
-    return isinstance(value, str | QuotedString) or is_settings
+    if isinstance(value, str | QuotedString):
+        return True
+    is_top_level = "/" not in group
+    return is_top_level and isinstance(value, dict) and value != {}

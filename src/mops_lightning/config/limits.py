@@ -54,6 +54,12 @@ def one_of(*choices: str, others: tuple[Any, ...] = ()) -> Limits:
     return Limits(f"one of {', '.join(choices)}", lambda x: x in allowed, choices)
 
 
+def _unlimited_or(minimum: int) -> Limits:
+    """Allow -1, Lightning's value for no limit, and whole numbers of at least ``minimum``."""
+    numbers = whole(minimum)
+    return Limits(f"-1 or {numbers.allowed}", lambda x: x == -1 or numbers.fits(x))
+
+
 ABOVE_ZERO = number("above 0", lambda x: x > 0)
 
 _ELSEWHERE = {
@@ -63,13 +69,9 @@ _ELSEWHERE = {
 """Arguments of Lightning's trainer that are groups of settings, and how to set these."""
 
 TRAINER = {
-    "max_epochs": Limits(
-        "-1 or a whole number of at least 0", lambda x: x == -1 or whole(0).fits(x)
-    ),
+    "max_epochs": _unlimited_or(0),
     # Lightning uses these only when training begins, after pretraining.
-    "max_steps": Limits(
-        "-1 or a whole number of at least 1", lambda x: x == -1 or whole(1).fits(x)
-    ),
+    "max_steps": _unlimited_or(1),
     "max_time": Limits("null or a time, such as 00:08:00:00", lambda x: x is None or bool(x)),
     "gradient_clip_val": Limits(
         "null or a number above 0", lambda x: x is None or ABOVE_ZERO.fits(x)

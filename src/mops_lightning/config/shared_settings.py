@@ -12,6 +12,8 @@ from mops_lightning.tree import dotted
 
 OWN = "mops_lightning."
 """Package of the classes whose defaults are known; a record's other classes are not imported."""
+FROM_DATA = ("point_channels",)
+"""Arguments with a default that a run fills in from its data; ``dataset.features`` decides them."""
 
 
 def effective(config: Mapping[str, Any], learn: str) -> dict[str, Any]:
@@ -24,8 +26,8 @@ def effective(config: Mapping[str, Any], learn: str) -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for name, node in config.items():
         if settings.of(name).per_learn and isinstance(node, dict):
-            entry = "task" if learn == "task" else "sampler"
-            node = node.get(entry)
+            trained = "task" if learn == "task" else "sampler"
+            node = node.get(trained)
             if node is None:  # no augmentation
                 continue
         for path, value in dotted(node, name).items():
@@ -62,13 +64,9 @@ def table_settings(config: Mapping[str, Any], learn: str) -> dict[str, Any]:
             defaults[declaration.name] = declaration.default
     defaults["augment"] = {"task": no_augmentation, "sampler": no_augmentation}
     known = {name: node for name, node in config.items() if name in settings.declared()}
-    flat = effective(defaults, learn)
-    flat |= effective(with_defaults(known), learn)
-    return {path: value for path, value in flat.items() if settings.of(path).compared}
-
-
-FROM_DATA = ("point_channels",)
-"""Arguments with a default that a run fills in from its data; ``dataset.features`` decides them."""
+    values = effective(defaults, learn)
+    values |= effective(with_defaults(known), learn)
+    return {path: value for path, value in values.items() if settings.of(path).compared}
 
 
 def with_defaults(node: Any) -> Any:
@@ -101,5 +99,7 @@ def _defaults(target: str) -> dict[str, Any]:
         value = parameter.default
         if value is parameter.empty or name in FROM_DATA:
             continue
-        defaults[name] = list(value) if isinstance(value, tuple) else value
+        if isinstance(value, tuple):  # as YAML has it
+            value = list(value)
+        defaults[name] = value
     return defaults

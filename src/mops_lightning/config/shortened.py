@@ -11,7 +11,7 @@ def _is_set(value: Any) -> bool:
     return bool(value)
 
 
-def _is_part(value: Any) -> bool:
+def _leaves_batches_out(value: Any) -> bool:
     """Return whether a limit of batches leaves some out: Lightning reads 1.0 as all, 1 as one."""
     is_all = isinstance(value, float) and value == 1.0
     return value is not None and not is_all
@@ -24,7 +24,7 @@ def _is_limit(value: Any) -> bool:
 SHORTENS: dict[str, Callable[[Any], bool]] = {
     "fast_dev_run": _is_set,
     "overfit_batches": _is_set,
-    "limit_train_batches": _is_part,
+    "limit_train_batches": _leaves_batches_out,
     "max_steps": _is_limit,
     "max_time": _is_limit,
 }
@@ -55,9 +55,11 @@ def shortening(config: Mapping[str, Any]) -> list[str]:
         config: the run's settings as plain data, such as a record's or a weights file's.
     """
     trainer = config.get("trainer") or {}
-    is_length = trainer.get("max_epochs") == UNLIMITED
-    return [
-        f"trainer.{name}={trainer[name]}"
-        for name, shortens in SHORTENS.items()
-        if name in trainer and shortens(trainer[name]) and not (name == "max_steps" and is_length)
-    ]
+    is_planned_in_steps = trainer.get("max_epochs") == UNLIMITED
+    settings = []
+    for name, shortens in SHORTENS.items():
+        if name == "max_steps" and is_planned_in_steps:
+            continue
+        if name in trainer and shortens(trainer[name]):
+            settings.append(f"trainer.{name}={trainer[name]}")
+    return settings

@@ -171,10 +171,11 @@ class CloudVisualization(Callback):
         cloud = (len(self.titles) - 1) // 2
         info = MetricInfo.of(module.task.score, module.task.metrics()[module.task.score])
         labels = {module.main_readout: type(module.sampler).__name__, FULL: "all points"}
-        captions = {}
-        for name in (*samples, FULL):
+        prefixes: dict[str, str] = dict.fromkeys(samples, module.prefixes[module.m])
+        prefixes[FULL] = ""
+        captions: dict[str, str] = {}
+        for name, prefix in prefixes.items():
             captions[name] = labels.get(name, name)
-            prefix = "" if name == FULL else module.prefixes[module.m]
             score = scores.get(f"test/{prefix}{name}/{info.name}")
             if score is not None:
                 captions[name] += f": {info.format(float(score))} {info.unit}"

@@ -41,11 +41,11 @@ def run(cfg: DictConfig, folder: Path, overrides: list[str] | None = None) -> Ru
     Raises:
         UserError: a mistake in settings or files.
     """
-    given = overrides or []
-    cfg = checked(cfg, given)
+    overrides = overrides or []
+    cfg = checked(cfg, overrides)
     if not distributed.is_worker_rank(cfg):
         claim(folder)
-    return run_in(folder, cfg, given)
+    return run_in(folder, cfg, overrides)
 
 
 def run_in(folder: Path, cfg: DictConfig, overrides: list[str]) -> RunRecord:
