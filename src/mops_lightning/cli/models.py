@@ -28,7 +28,7 @@ def main(arguments: list[str], prog: str) -> None:
     """Do what the arguments say.
 
     Args:
-        arguments: of the command line.
+        arguments: the arguments behind the subcommand.
         prog: what the user typed to start this command.
     """
     with one_line_endings(prog):
@@ -198,7 +198,7 @@ def export(arguments: list[str], prog: str) -> None:
     """Write the file and print how far its points are from the sampler's.
 
     Args:
-        arguments: of the command line.
+        arguments: the arguments behind the subcommand.
         prog: what the user typed to start this command.
     """
     parser = Parser(prog, EXPORT)

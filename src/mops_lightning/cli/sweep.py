@@ -37,7 +37,7 @@ def run_cell(cfg: DictConfig, folder: Path, overrides: list[str]) -> float:
     Args:
         cfg: the cell's configuration.
         folder: the cell's folder.
-        overrides: of the sweep and the user, for the record.
+        overrides: what the sweep and the user changed, for the record.
 
     Returns:
         The score. NaN if the cell failed, so that the sweep continues; the record and the log say

@@ -91,7 +91,7 @@ def flags_first(arguments: list[str]) -> list[str]:
     """Move Hydra's flags, such as ``--multirun``, before the settings: Hydra wants these together.
 
     Args:
-        arguments: of the command line, such as ``["m=8", "--cfg", "job", "sampler=fps"]``.
+        arguments: the whole command line, such as ``["m=8", "--cfg", "job", "sampler=fps"]``.
 
     Returns:
         The same arguments; flags with their values and settings keep their order.

@@ -203,7 +203,7 @@ def _with_path(
     Args:
         error: as the constructor raised it.
         node: the configuration of the object, unresolved.
-        where: its dotted path.
+        where: the dotted path of this configuration.
         extra: arguments that code gave, not the configuration.
     """
     text = str(error)

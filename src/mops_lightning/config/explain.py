@@ -35,7 +35,7 @@ def explain(error: BaseException, arguments: Sequence[str]) -> str:
 
     Args:
         error: raised while a configuration was composed.
-        arguments: of the command line, or the overrides.
+        arguments: the arguments of the command line, or the overrides.
     """
     if isinstance(error, UnicodeDecodeError):
         return f"a file of settings is not in UTF-8: {error.object[:30]!r}: {error.reason}."
@@ -89,7 +89,7 @@ def _no_such_choice(file: str, options: Sequence[str], arguments: Sequence[str])
     """Name the choices nearest to one that no file describes.
 
     Args:
-        file: that Hydra did not find, such as ``sampler/mop``.
+        file: the file that Hydra did not find, such as ``sampler/mop``.
         options: the choices of the group.
         arguments: the overrides.
     """
@@ -107,7 +107,7 @@ def _from_words(text: str, texts: Sequence[str], arguments: Sequence[str]) -> st
     """Return one line about an error of which only the message says what is wrong.
 
     Args:
-        text: its message.
+        text: the message of the error.
         texts: the messages of all its causes.
         arguments: the overrides.
     """

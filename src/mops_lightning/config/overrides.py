@@ -104,8 +104,8 @@ def as_typed(arguments: Any) -> list[str]:
     """Return a list of overrides with their interpolations as the user typed them.
 
     Args:
-        arguments: of ``hydra.overrides``, where OmegaConf would resolve them among Hydra's own
-            settings.
+        arguments: a list in ``hydra.overrides``; OmegaConf would resolve its interpolations among
+            Hydra's own settings.
     """
     plain: Any = OmegaConf.to_container(arguments, resolve=False)
     return list(plain)

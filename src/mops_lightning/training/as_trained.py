@@ -75,7 +75,7 @@ def _check_sampler(recorded: dict[str, Any], present: dict[str, Any], name: str)
     Args:
         recorded: the sampler's settings in the run.
         present: those of the evaluation.
-        name: of the run.
+        name: name of the run, for the error.
 
     Raises:
         UserError: a setting differs.

@@ -66,7 +66,7 @@ class Checkpoint:
 
     Attributes:
         path: the file.
-        identity: of the run that wrote it; see ``checkpoint_identity``.
+        identity: identity of the run that wrote it; see ``checkpoint_identity``.
         planned: epochs for which this run was planned.
         done: epochs that it had trained.
         steps: optimizer steps that it had trained.

@@ -236,7 +236,7 @@ def _may_change(path: str, has_new_net: bool) -> bool:
     """Return whether an evaluation may change a setting; unknown ones are refused later.
 
     Args:
-        path: of the setting.
+        path: dotted path of the setting.
         has_new_net: whether the evaluation trains another task net.
     """
     top = path.partition(".")[0]

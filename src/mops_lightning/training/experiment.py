@@ -44,8 +44,8 @@ class Experiment(L.LightningModule):
         task: see ``tasks``.
         sampler: None only for ``learn="task"``, which does not use it.
         learn: what is trained. The rest is frozen: no gradients, evaluation mode.
-        make_optimizer: from parameters to optimizer; not needed for testing only.
-        make_schedule: from (optimizer, total_steps) to a per-step schedule.
+        make_optimizer: makes an optimizer from groups of parameters; a test needs none.
+        make_schedule: makes a schedule per step from ``(optimizer, total_steps)``.
         baselines: index samplers to test for comparison, by name.
         seed: what happens in step i of epoch e depends on (seed, e, i) only.
         identity: kept in checkpoints, so that none is resumed under other settings.
@@ -53,7 +53,7 @@ class Experiment(L.LightningModule):
             several, the metrics are named ``test/m32/generated/accuracy`` and so on.
         recipe: how the sampler is trained beyond its own losses; None: by these alone.
         task_lr_scale: with ``learn="joint"``, the task net's learning rate over the sampler's.
-        other_tasks: the task with further frozen nets, under which the sampler is trained, too.
+        other_tasks: the task with further frozen nets, whose losses train the sampler, too.
         test_logger: False keeps test metrics from the loggers and from ``trainer.test``'s result;
             None: they go to a logger if there is one.
         m: the size that is validated and gives the run's score; None: the sampler's.

@@ -24,8 +24,8 @@ class MuonAdam(Optimizer):
     Args:
         params: parameters or groups of parameters.
         lr: learning rate of both.
-        momentum: of Muon.
-        betas: of Adam.
+        momentum: momentum of Muon.
+        betas: betas of Adam.
         smallest: fewest rows and columns of a matrix that Muon updates. Smaller ones, such as the
             layer that reads coordinates, have too few directions to balance.
     """

@@ -82,7 +82,7 @@ def step_decay(
         optimizer: its learning rate is the first one.
         total_steps: unused; all schedules share this signature.
         every: steps between two decays.
-        factor: of one decay.
+        factor: factor of one decay.
         floor_lr: smallest rate.
 
     Raises:

@@ -19,7 +19,7 @@ class Scores(nn.Module):
     Args:
         make_metrics: makes a collection of the task's metrics.
         readouts: names of the readouts.
-        prefixes: of the sizes, such as ``m32/``; the empty one is always there.
+        prefixes: prefixes of the sizes, such as ``m32/``; the empty one is added.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class Scores(nn.Module):
             points: ``(B, N, 3)`` the clouds.
             outputs: the sampler's, by size.
             nested: whether smaller sets are the first points of larger ones.
-            prefixes: by size.
+            prefixes: prefix of the log keys, by size.
         """
         # The largest nested set contains all smaller ones, so it is measured once for all.
         groups: dict[int, tuple[int, ...]] = {m: (m,) for m in outputs}

@@ -34,7 +34,7 @@ class Distillation:
 
     Args:
         tasks: with one task net each; all are compared with the first one's predictions.
-        recipe: for the weights of the losses.
+        recipe: gives the weights of the losses.
     """
 
     def __init__(self, tasks: Sequence[Task], recipe: Recipe) -> None:
@@ -50,9 +50,9 @@ class Distillation:
         its batch. Not earlier, because a resumed run has its task net from the checkpoint.
 
         Args:
-            loader: of the training clouds.
+            loader: the loader of the training clouds.
             device: where to compute.
-            dtype: of the nets, which ``trainer.precision`` may lower.
+            dtype: dtype of the nets, which ``trainer.precision`` may lower.
         """
         fixed = isinstance(loader, CloudLoader) and loader.keeps_clouds
         if self.predicts and fixed:
@@ -79,7 +79,7 @@ class Distillation:
         """Return the weighted losses of a sample under one task net.
 
         Args:
-            number: of the task net.
+            number: number of the task net.
             points: ``(B, M, 3)`` the sample.
             output: the task net's output for it.
             targets: see ``targets``.
@@ -127,9 +127,9 @@ def full_predictions(
 
     Args:
         task: in evaluation mode, on ``device``.
-        loader: of clouds that it does not change.
+        loader: a loader that does not change its clouds.
         device: where to compute.
-        dtype: of the task net.
+        dtype: dtype of the task net.
 
     Returns:
         One row per cloud, in the order of ``Batch.rows``; see ``Task.predict``.

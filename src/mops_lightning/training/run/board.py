@@ -43,7 +43,7 @@ class Board(TensorBoardLogger):
         version: a folder below the name's.
         log_graph: whether the net's graph is logged.
         default_hp_metric: whether a metric of -1 is logged with settings.
-        prefix: of all names.
+        prefix: prefix of all names.
         sub_dir: a folder below the version's.
         **writer: settings of torch's ``SummaryWriter``.
     """
@@ -83,9 +83,9 @@ class Board(TensorBoardLogger):
         settings that differ first.
 
         Args:
-            record: of the run, with its metrics.
-            scores: the metrics that stand beside the settings.
-            step: of the training.
+            record: the run's record, with its metrics.
+            scores: the metrics that are shown beside the settings.
+            step: step of the training.
         """
         lines = ["| metric | value |", "|---|--:|"]
         for name, value in sorted(record.metrics.items()):
@@ -102,7 +102,7 @@ class Board(TensorBoardLogger):
         Args:
             points: ``(K, N, 3)`` input.
             samples: ``(K, M, 3)`` by readout.
-            step: of the training.
+            step: step of the training.
         """
         cloud = thinned(points.detach().cpu().float())
         grey = torch.tensor(INPUT_COLOUR).expand(cloud.shape)

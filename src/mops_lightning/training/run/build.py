@@ -33,7 +33,7 @@ def build_parts(
         cfg: the run's settings.
         folder: the run's folder.
         dataset: the loaded data.
-        record: is told about data, device and the resumed run.
+        record: the run's record, which is filled with data, device and the resumed run.
         trained: the run that is evaluated.
 
     Raises:

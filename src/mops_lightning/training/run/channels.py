@@ -37,7 +37,7 @@ def scaled_as_trained(
     Without given nets, the statistics are those of the training split.
 
     Args:
-        dataset: as loaded.
+        dataset: the loaded data.
         cfg: the run's settings.
         trained: the run that is evaluated.
 

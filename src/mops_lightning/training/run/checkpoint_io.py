@@ -24,8 +24,8 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         """Write ``checkpoint`` to ``path``; until it is complete, the previous one stays.
 
         Args:
-            checkpoint: as Lightning makes it.
-            path: of a local file.
+            checkpoint: the state, as Lightning collects it.
+            path: path of a local file.
             storage_options: not used.
         """
         buffer = io.BytesIO()  # torch.save hides the OSError of a full disk

@@ -81,7 +81,7 @@ def load_trained(
     Args:
         trained: the run.
         with_task_net: whether the run's task net is loaded, if it has weights.
-        experiment: gets the weights.
+        experiment: the experiment whose nets are filled.
         dataset: the data to test on.
 
     Returns:

@@ -43,8 +43,8 @@ def log_test(trainer: L.Trainer, record: RunRecord, scores: dict[str, float]) ->
     """Log the test: metrics, and the settings that distinguish runs with the main scores.
 
     Args:
-        trainer: its logger gets them, if it has one.
-        record: of the run, with its metrics.
+        trainer: the trainer whose logger is used, if it has one.
+        record: the run's record, with its metrics.
         scores: the metrics of every readout at the run's own size, for TensorBoard's HPARAMS.
     """
     logger = trainer.logger

@@ -17,8 +17,8 @@ class OptimizerMakers:
     """Functions that make the optimizer and the schedule that a node of settings describes.
 
     Attributes:
-        optimizer: from parameters or their groups to the optimizer.
-        schedule: from (optimizer, total_steps) to its schedule; None: the rate is constant.
+        optimizer: makes an optimizer from parameters or groups of parameters.
+        schedule: makes a schedule from ``(optimizer, total_steps)``; None: the rate is constant.
     """
 
     optimizer: Callable[..., Optimizer]

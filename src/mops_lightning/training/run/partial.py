@@ -21,8 +21,8 @@ def note_training(trainer: L.Trainer, batches: int, record: RunRecord) -> None:
 
     Args:
         trainer: after its training.
-        batches: of a whole epoch.
-        record: to fill.
+        batches: batches of a whole epoch.
+        record: the run's record, which is filled.
     """
     settings = record.config["trainer"]
     for name in ("fast_dev_run", "overfit_batches"):
@@ -67,8 +67,8 @@ def note_task_net(config: Mapping[str, Any], record: RunRecord) -> None:
     """Note that the loaded task net comes from a shortened training.
 
     Args:
-        config: of the run that trained the net, from its weights file.
-        record: to fill.
+        config: settings of the run that trained the net, from its weights file.
+        record: the record of the run that uses it.
     """
     reasons = shortening(config)
     if reasons:
@@ -79,9 +79,9 @@ def note_evaluated(name: str, trained: RunRecord, record: RunRecord) -> None:
     """Note that the run which is tested again was shortened.
 
     Args:
-        name: of that run.
-        trained: its record.
-        record: to fill.
+        name: name of the tested run.
+        trained: the tested run's record.
+        record: the record of the test.
     """
     reasons = [reason for reason in trained.partial if not reason.startswith(OF_TEST)]
     if reasons:

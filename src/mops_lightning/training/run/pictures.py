@@ -43,7 +43,7 @@ class CloudVisualization(Callback):
             ``Augmentation.rotate_up``; true and false mean y.
         colour: name of the channel that gives the colours of the clouds; None: each readout has
             its colour.
-        channels: of the points.
+        channels: channels of the points.
 
     Raises:
         UserError: there is no such axis or channel.
@@ -110,7 +110,7 @@ class CloudVisualization(Callback):
         """Draw the clouds with the nets as they are.
 
         Args:
-            trainer: its precision and device are used.
+            trainer: gives precision and device.
             module: the experiment.
             scores: test metrics by name; None before the test. Baselines do not change in
                 training, so they are drawn once, with the scores.

@@ -37,7 +37,7 @@ def task_weights(cfg: DictConfig, dataset: CloudDataset, run_folder: Path) -> Pa
 
     Args:
         cfg: the run's settings.
-        dataset: to train on.
+        dataset: the data to train on.
         run_folder: where a shortened training leaves its net, which is not cached.
 
     Returns:

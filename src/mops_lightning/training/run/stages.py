@@ -47,8 +47,8 @@ def train_and_test(parts: Parts, record: RunRecord, task_weights: Path | None) -
     """Run all stages in their order.
 
     Args:
-        parts: of the run.
-        record: of the run, to fill.
+        parts: the parts of the run.
+        record: the run's record, which is filled.
         task_weights: a file for the task net; None leaves it as initialised.
     """
     load_weights(parts, record, task_weights)

@@ -60,8 +60,8 @@ def make_trainer(
     Args:
         cfg: a composed configuration.
         folder: the run's folder.
-        dataset: for the pictured clouds.
-        experiment: for its task and recipe.
+        dataset: the data, of which some clouds are drawn.
+        experiment: gives the task and the recipe.
         clouds: number of clouds to train on.
 
     Raises:
