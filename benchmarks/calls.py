@@ -133,9 +133,13 @@ def table(record: dict[str, Any]) -> str:
         f"|---|---|{'--:|' * len(calls)}",
     ]
     for (method, points), found in seconds.items():
-        cells = [f"{1e3 * found[call]:.3g}" if call in found else "" for call in calls]
+        cells = [_milliseconds(found[call]) if call in found else "" for call in calls]
         lines.append(f"| {method} | {points} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
+
+
+def _milliseconds(seconds: float) -> str:
+    return f"{1e3 * seconds:,.0f}" if seconds >= 1 else f"{1e3 * seconds:.3g}"
 
 
 def page(record: dict[str, Any]) -> str:
@@ -145,10 +149,12 @@ def page(record: dict[str, Any]) -> str:
     versions = ", ".join(f"{name} {number}" for name, number in record["others"].items())
     left_out = "; ".join(f"{name} is left out: {why}" for name, why in record["left_out"].items())
     spread = max(row["spread"] / row["seconds"] for row in record["cases"])
+    numbers = sorted({row["rounds"] for row in record["cases"]})
+    rounds = " or ".join(str(number) for number in numbers)
     return (
         "# Calls\n\n"
         f"Milliseconds. {record['machine']['cpu']}, one thread, processor time on a busy machine, "
-        f"medians of {record['rounds']} rounds; the distance between the quartiles is at most "
+        f"medians of {rounds} rounds; the distance between the quartiles is at most "
         f"{spread:.0%} of the median. Commit {git['commit'][:10]}{changes}; {versions}. "
         f"{left_out}. `python benchmarks/calls.py`\n\n" + table(record)
     )

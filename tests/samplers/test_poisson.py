@@ -115,13 +115,14 @@ def test_eliminate_of_points_not_contiguous_or_with_gradients_equals_plain_form(
     assert torch.equal(chosen, PoissonSampler(30)(points).indices)
 
 
-def test_eliminate_of_many_copies_does_not_overflow():
+def test_eliminate_of_many_copies_removes_the_lowest_row_of_them():
     points = torch.zeros(1, 8200, 3)
     points[0, 0] = 1.0
 
     kept = eliminate(points, 8199)
 
-    assert kept[0, 0] == 0  # the only point that is not crowded
+    # Row 0 is the only point that is not crowded; row 1 is the first of the others.
+    assert kept[0].tolist() == [0, *range(2, 8200)]
 
 
 @pytest.mark.parametrize("m", [2, 5, 12])
