@@ -34,8 +34,10 @@ nre_emd: nre emd, 0.01235, False, 2, emd
 nre_cd_of_means: nre cd of means, 0.01235, False, None, chamfer
 nre_emd_of_means: nre emd of means, 0.01235, False, None, emd
 rotation_error_deg: rotation error (°), 0.01, False, 1, None
+median_rotation_error_deg: median rotation error (°), 0.01, False, 0, None
 rotation_error_p90_deg: rotation error p90 (°), 0.01, False, 2, None
 rotation_error_doubled_deg: rotation error doubled (°), 0.01, False, None, None
+rotation_recall_2deg: rotation recall 2deg (%), 1.23, True, 3, None
 rotation_recall_5deg: rotation recall 5deg (%), 1.23, True, 3, None
 rotation_recall_10deg: rotation recall 10deg (%), 1.23, True, 4, None
 translation_error: translation error, 0.01235, False, 5, None
@@ -71,7 +73,7 @@ def test_metric_documents_itself(metric):
 
 def batch(metric):
     """What a metric is updated with."""
-    turned = torch.nn.functional.normalize(torch.tensor([[1.0, 0.02, 0, 0]]))
+    turned = torch.nn.functional.normalize(torch.tensor([[1.0, 0.01, 0, 0]]))
     still = torch.eye(4)[:1]
     return {
         "classification": (torch.eye(3), torch.tensor([0, 1, 1])),

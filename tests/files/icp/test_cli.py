@@ -82,7 +82,7 @@ def test_two_runs_of_one_seed_find_the_same_errors(scans, tmp_path):
         found.append([(row["method"], row["degrees"], row["shift"]) for row in rows])
 
     assert found[0] == found[1]
-    assert len(found[0]) == 2 * (1 + 10)
+    assert len(found[0]) == 2 * (1 + 11)
 
 
 def test_frames_with_poses_are_aligned_to_the_true_motion(tmp_path, capsys):
