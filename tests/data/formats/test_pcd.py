@@ -1,5 +1,7 @@
 """PCD files."""
 
+import struct
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,19 @@ from mops_lightning.errors import UserError
 
 HEAD = (
     "FIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\nWIDTH 40\nHEIGHT 1\nPOINTS 40\n"
+)
+
+COMPRESSED_HEAD = (
+    b"# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\n"
+    b"TYPE F F F\nCOUNT 1 1 1\nWIDTH 20\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 20\n"
+    b"DATA binary_compressed\n"
+)
+
+COMPRESSED_SIZES = struct.pack("<II", 36, 240)
+
+# Written by Open3D 0.20: ten times (0, 1, 2), then ten times (0.5, -1, 2).
+COMPRESSED = bytes.fromhex(
+    "010000e02000003f2029e01a0300802023e01c0300bf2027e01a03010040e04103010040"
 )
 
 
@@ -36,10 +51,39 @@ def test_pcd_impossible_count_is_broken(tmp_path):
         read(path, 9, 0)
 
 
-def test_pcd_compressed_names_the_converter(tmp_path):
+def test_pcd_unknown_encoding_is_refused(tmp_path):
     path = tmp_path / "a.pcd"
-    path.write_text(f"{HEAD}DATA binary_compressed\n")
-    with pytest.raises(UserError, match=r"not ascii or binary\. Convert it by .* OUT\.pcd 1"):
+    path.write_text(f"{HEAD}DATA zipped\n")
+
+    with pytest.raises(UserError, match="DATA zipped, not ascii, binary or binary_compressed"):
+        read(path, 9, 0)
+
+
+def test_pcd_compressed_by_open3d_is_read(tmp_path):
+    path = tmp_path / "a.pcd"
+    path.write_bytes(COMPRESSED_HEAD + COMPRESSED_SIZES + COMPRESSED)
+
+    table = read(path, 9, 0)
+
+    first = [[0.0, 1.0, 2.0]] * 10
+    second = [[0.5, -1.0, 2.0]] * 10
+    assert table.points.tolist() == first + second
+    assert table.form.coordinates == np.float32
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        pytest.param(COMPRESSED_SIZES[:6], "end early", id="no sizes"),
+        pytest.param(COMPRESSED_SIZES + COMPRESSED[:-1], "end early", id="cut"),
+        pytest.param(struct.pack("<II", 36, 241) + COMPRESSED, "241 bytes are not 20", id="size"),
+    ],
+)
+def test_pcd_broken_compression_is_refused(tmp_path, body, message):
+    path = tmp_path / "a.pcd"
+    path.write_bytes(COMPRESSED_HEAD + body)
+
+    with pytest.raises(UserError, match=f"a.pcd is broken: .*{message}"):
         read(path, 9, 0)
 
 

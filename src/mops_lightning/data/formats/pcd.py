@@ -1,5 +1,6 @@
-"""PCD files of the Point Cloud Library, version 0.7: ascii and binary."""
+"""PCD files of the Point Cloud Library, version 0.7: ascii, binary and binary_compressed."""
 
+import struct
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,11 +17,15 @@ from mops_lightning.data.formats.columns import (
     unique_names,
 )
 from mops_lightning.data.formats.guard import BadCloudError
+from mops_lightning.data.formats.lzf import decompress
 from mops_lightning.data.formats.table import Column, Table
 
 KINDS = {"F": "f", "I": "i", "U": "u"}
 
 TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
+
+SIZES = struct.Struct("<II")
+"""Before compressed points: their number of bytes in the file, and after decompression."""
 
 NO_VIEWPOINT = "0 0 0 1 0 0 0"
 
@@ -148,10 +153,29 @@ def _body(path: Path, body: bytes, kind: str, layout: np.dtype[Any], number: int
         return _ascii_rows(body, layout, number)
     if kind == "binary":
         return np.frombuffer(body, layout, number)
-    raise BadCloudError(
-        f"{path} has DATA {kind}, which is not ascii or binary. Convert it by PCL's "
-        f"pcl_convert_pcd_ascii_binary {path} OUT.pcd 1."
-    )
+    if kind == "binary_compressed":
+        return _decompressed_rows(body, layout, number)
+    raise BadCloudError(f"{path} has DATA {kind}, not ascii, binary or binary_compressed.")
+
+
+def _decompressed_rows(body: bytes, layout: np.dtype[Any], number: int) -> NDArray[Any]:
+    """Return the rows of a compressed file, which holds one field after the other."""
+    if len(body) < SIZES.size:
+        raise ValueError("its compressed points end early")
+    compressed, size = SIZES.unpack_from(body)
+    if size != number * layout.itemsize:
+        raise ValueError(f"{size} bytes are not {number} points")
+    stream = body[SIZES.size : SIZES.size + compressed]
+    if len(stream) < compressed:
+        raise ValueError("its compressed points end early")
+    values = decompress(stream, size)
+    rows = np.empty(number, layout)
+    start = 0
+    for name in layout.names or ():
+        of_field = np.frombuffer(values, layout[name], number, offset=start)
+        rows[name] = of_field
+        start += number * layout[name].itemsize
+    return rows
 
 
 def _ascii_rows(body: bytes, layout: np.dtype[Any], number: int) -> NDArray[Any]:
