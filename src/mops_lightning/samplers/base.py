@@ -34,14 +34,14 @@ class Sampler(nn.Module):
     ``sample(points, m)``. A learned sampler also implements ``losses``, a flexible one
     ``training_sizes``, and a sampler with a training schedule ``anneal``.
 
-    Points may have C channels beside their coordinates: ``(B, N, 3 + C)``. ``sample`` sees those
-    channels that the sampler was made for. A sampler without learned weights takes points with any
-    channels. Sampled points have all channels of their input: where ``sample`` returns coordinates
-    only, each point has the channels of its input point or, if it is generated, of the nearest one.
+    Points may have C channels beside their coordinates: ``(B, N, 3 + C)``. ``sample`` sees
+    coordinates, unless a subclass sets ``self.point_channels``: then it sees points with these
+    channels. A sampler without learned weights takes points with any channels. Sampled points have
+    all channels of their input: where ``sample`` returns coordinates only, each point has the
+    channels of its input point or, if it is generated, of the nearest one.
 
     Args:
         m: number of points to return; for a flexible sampler, the largest number.
-        point_channels: the channels that ``sample`` sees, or their number.
 
     Raises:
         UserError: ``m`` is not a whole number of at least 1.
@@ -87,12 +87,12 @@ class Sampler(nn.Module):
     size_reduction: Literal["mean", "sum"] = "mean"
     """Reduction of the losses at several ``training_sizes`` to one."""
 
-    def __init__(self, m: int, point_channels: PointChannels | int = 0) -> None:
+    def __init__(self, m: int) -> None:
         super().__init__()
         if isinstance(m, bool) or not isinstance(m, int) or m < 1:
             raise UserError(f"m must be a whole number of at least 1, got {m!r}.")
         self.m = m
-        self.point_channels = PointChannels.of(point_channels)
+        self.point_channels = PointChannels.of(0)
 
     def forward(self, points: Tensor, m: int | None = None) -> SampleOutput:
         """Sample every cloud of a batch.

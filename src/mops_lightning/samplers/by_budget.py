@@ -52,7 +52,8 @@ class ByBudget(Sampler):
         samplers: Sequence[Sampler],
         point_channels: PointChannels | int = 0,
     ) -> None:
-        super().__init__(MOST, point_channels)
+        super().__init__(MOST)
+        self.point_channels = PointChannels.of(point_channels)
         if not samplers or not isinstance(samplers[0], FPSSampler):
             raise UserError("samplers must begin with farthest point sampling.")
         is_ascending = list(budgets) == sorted(set(budgets))

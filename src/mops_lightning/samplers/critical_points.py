@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from mops_lightning.channels import coordinates
+from mops_lightning.channels import PointChannels, coordinates
 from mops_lightning.errors import UserError
 from mops_lightning.ops.fps import farthest_point_fill
 from mops_lightning.ops.points import gather_points
@@ -55,7 +55,8 @@ class CriticalSampler(Sampler):
     nested = True
 
     def __init__(self, m: int, net: nn.Module | None = None, seed: int = 0) -> None:
-        super().__init__(m, getattr(net, "point_channels", 0))
+        super().__init__(m)
+        self.point_channels = PointChannels.of(getattr(net, "point_channels", 0))
         if not isinstance(net, PointFeatureNet | None):
             raise UserError(
                 "net must have features of single points under a maximum (point_features), as "

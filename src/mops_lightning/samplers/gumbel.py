@@ -55,7 +55,8 @@ class GumbelSampler(Sampler):
         feature_channels: Sequence[int] = (64, 64, 64, 128, 128),
         point_channels: PointChannels | int = 0,
     ) -> None:
-        super().__init__(m, point_channels)
+        super().__init__(m)
+        self.point_channels = PointChannels.of(point_channels)
         if not 0 < tau_min <= 1:
             raise UserError(f"tau_min must be above 0 and at most 1, got {tau_min}.")
         check_channels("feature_channels", feature_channels)

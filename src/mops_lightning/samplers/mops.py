@@ -87,7 +87,8 @@ class MOPSNet(Sampler):
         neighbours: int | None = None,
         point_channels: PointChannels | int = 0,
     ) -> None:
-        super().__init__(m, point_channels)
+        super().__init__(m)
+        self.point_channels = PointChannels.of(point_channels)
         if not 0 < tau_min <= 1:
             raise UserError(f"tau_min must be above 0 and at most 1, got {tau_min}.")
         check_at_least(0, alpha=alpha, overlap=overlap)

@@ -54,7 +54,8 @@ class SNet(Sampler):
         output_norm: bool = True,
         point_channels: PointChannels | int = 0,
     ) -> None:
-        super().__init__(m, point_channels)
+        super().__init__(m)
+        self.point_channels = PointChannels.of(point_channels)
         check_at_least(0, alpha=alpha, coverage=coverage, coverage_per_point=coverage_per_point)
         check_channels("feature_channels", feature_channels, 2)
         check_channels("head_channels", head_channels)

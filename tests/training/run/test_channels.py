@@ -11,12 +11,14 @@ import torch
 
 from mops_lightning import FPSSampler, MOPSNet, load
 from mops_lightning.channels import Channel, PointChannels
+from mops_lightning.config.compose import compose
 from mops_lightning.data.formats.registry import WRITERS, read
 from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.run.channels import check_sampler
+from mops_lightning.training.run.make_experiment import make_experiment
 from mops_lightning.zoo.publish import add
 from tests.support import downsample
 from tests.support.command_line import TINY_ANY_DATA, done, refused, runs
@@ -54,6 +56,18 @@ def trained(folder):
     done([*SETTINGS, "task=classification", "sampler=fmops", "sampler.m_max=8"], folder)
     (run,) = runs(folder)
     return run
+
+
+@pytest.fixture
+def with_intensity():
+    """Small data whose points have one channel."""
+    dataset = small_dataset()
+    train, test = (
+        clouds._replace(points=torch.cat([clouds.points, clouds.points[..., :1] ** 2], 2))
+        for clouds in (dataset.train, dataset.test)
+    )
+    channels = PointChannels([Channel("intensity")])
+    return replace(dataset, train=train, test=test, channels=channels)
 
 
 def test_weights_know_the_statistics_of_the_training_split(trained):
@@ -184,6 +198,33 @@ def test_learned_sampler_without_channels_is_refused():
     check_sampler(FPSSampler(8), dataset)
     with pytest.raises(UserError, match=r"^sampler: MOPSNet takes x, y and z only, but .* intensi"):
         check_sampler(MOPSNet(8), dataset)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "covariance",
+        "fps",
+        "information",
+        "normal_space",
+        "poisson",
+        "random",
+        "serial",
+        "steady",
+        "voxel",
+    ],
+)
+def test_sampler_without_learned_weights_sees_coordinates(name, with_intensity):
+    cfg = compose([f"sampler={name}", "m=8", "learn=nothing"])
+    points = with_intensity.test.points
+
+    sampler: Any = make_experiment(cfg, with_intensity, {}).sampler
+
+    output = sampler(points)
+
+    expected = sampler(points[..., :3].contiguous())
+    assert torch.equal(output.indices, expected.indices)
+    assert output.points.shape == (len(points), 8, 4)
 
 
 def test_net_without_an_argument_for_channels_is_refused(folder):
