@@ -1,5 +1,6 @@
+import math
+from collections import Counter
 from functools import partial
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,8 @@ FORMATS = (".ply", ".pcd", ".bin", ".npy", ".npz", ".xyz", ".txt")
 
 def write(path, seed=0, number=300):
     path.parent.mkdir(parents=True, exist_ok=True)
-    points = np.random.default_rng(seed).normal(size=(number, 3)) * [3, 2, 1] + 50
+    unit = np.random.default_rng(seed).normal(size=(number, 3))
+    points = unit * [3, 2, 1] + 50
     WRITERS[path.suffix](path, Table(points))
 
 
@@ -32,22 +34,39 @@ def folder(tmp_path):
     return tmp_path
 
 
+def all_clouds(data):
+    """Return the clouds of both splits."""
+    return torch.cat([data.train.points, data.test.points])
+
+
 def test_cloud_folder_reads_every_format_without_labels_and_each_file_for_one_split(folder):
     data = cloud_folder(folder, n_points=64, crops=3)
+
+    train = data.train.points
     assert data.class_names == ("cloud",)
-    assert data.train.points.shape == (18, 64, 3)
+    assert train.shape == (18, 64, 3)
     assert data.test.points.shape == (6, 64, 3)
-    assert (data.notes["train_files"], data.notes["test_files"]) == (6, 2)
-    assert torch.isfinite(data.train.points).all()
-    assert data.train.points.norm(dim=2).amax(1).allclose(torch.ones(18))
-    assert data.train.points.mean(1).abs().max() < 1e-5
-    sources: list[Any] = [data.train.sources, data.test.sources]
-    train, test = sources
-    assert train.bincount()[train.unique()].eq(3).all()
-    assert not set(train.tolist()) & set(test.tolist())
+    assert data.notes["train_files"] == 6
+    assert data.notes["test_files"] == 2
+    assert torch.isfinite(train).all()
+    farthest = train.norm(dim=2).amax(1)
+    assert farthest.allclose(torch.ones(18))
+    assert train.mean(1).abs().max() < 1e-5
+    assert data.train.sources is not None
+    assert data.test.sources is not None
+    train_files = data.train.sources.tolist()
+    test_files = data.test.sources.tolist()
+    assert set(Counter(train_files).values()) == {3}
+    assert set(train_files).isdisjoint(test_files)
 
 
-@pytest.mark.parametrize(("crop", "expected"), [("whole", 1), ("nearest", 32)])
+@pytest.mark.parametrize(
+    ("crop", "expected"),
+    [
+        ("whole", 1),
+        ("nearest", 32),
+    ],
+)
 def test_cloud_folder_without_number_of_crops_draws_whole_clouds_once(tmp_path, crop, expected):
     for seed in range(4):
         write(tmp_path / f"scan_{seed}.ply", seed)
@@ -61,39 +80,55 @@ def test_cloud_folder_without_number_of_crops_draws_whole_clouds_once(tmp_path, 
 def test_cloud_folder_crops_do_not_depend_on_other_files(folder):
     everything = cloud_folder(folder, n_points=64, crops=2, crop="whole")
     (folder / "scan_3.npy").unlink()
+
     fewer = cloud_folder(folder, n_points=64, crops=2, crop="whole")
-    clouds = torch.cat([everything.train.points, everything.test.points])
-    for cloud in torch.cat([fewer.train.points, fewer.test.points]):
-        assert (clouds == cloud).all(2).all(1).any()
+
+    clouds = all_clouds(everything)
+    for cloud in all_clouds(fewer):
+        is_same = (clouds == cloud).all(2).all(1)
+        assert is_same.any()
     assert fewer.fingerprint != everything.fingerprint
 
 
 def test_cloud_folder_columns_name_those_of_bin_files(tmp_path):
     xyz = np.random.default_rng(0).normal(size=(300, 3)).astype(np.float32)
+    constant_first = np.insert(xyz, 0, 7.0, axis=1)
+    folder = tmp_path / "points"
+    folder.mkdir()
     for name in ("a", "b"):
-        np.insert(xyz, 0, 7.0, axis=1).tofile(tmp_path / f"{name}.bin")  # a constant comes first
-        WRITERS[".ply"](tmp_path / f"{name}.ply", Table(xyz.astype(np.float64)))
-    (tmp_path / "points").mkdir()
-    for name in ("a", "b"):
-        (tmp_path / f"{name}.ply").rename(tmp_path / "points" / f"{name}.ply")
-        (tmp_path / f"{name}.bin").rename(tmp_path / "points" / f"{name}_named.bin")
+        constant_first.tofile(folder / f"{name}_named.bin")
+        WRITERS[".ply"](folder / f"{name}.ply", Table(xyz.astype(np.float64)))
 
-    settings: dict[str, Any] = {"n_points": 300, "crops": 1, "crop": "whole", "test_share": 0.5}
-    data = cloud_folder(tmp_path, columns=["intensity", "x", "y", "z"], **settings)
+    data = cloud_folder(
+        tmp_path,
+        n_points=300,
+        crops=1,
+        crop="whole",
+        test_share=0.5,
+        columns=["intensity", "x", "y", "z"],
+    )
 
-    expected = xyz - xyz.mean(0)
-    expected = expected / np.linalg.norm(expected, axis=1).max()
-    for cloud in torch.cat([data.train.points, data.test.points]).numpy():
-        np.testing.assert_allclose(np.sort(cloud, axis=0), np.sort(expected, axis=0), atol=1e-5)
+    centred = xyz - xyz.mean(0)
+    expected = centred / np.linalg.norm(centred, axis=1).max()
+    expected.sort(axis=0)
+    for cloud in all_clouds(data).numpy():
+        cloud.sort(axis=0)
+        np.testing.assert_allclose(cloud, expected, atol=1e-5)
 
 
 def test_cloud_folder_folders_are_classes_and_splits(tmp_path):
-    for seed, name in enumerate(("tree/train/a", "tree/test/b", "car/train/c", "car/test/d")):
-        write(tmp_path / f"{name}.ply", seed)
+    write(tmp_path / "tree" / "train" / "a.ply", 0)
+    write(tmp_path / "tree" / "test" / "b.ply", 1)
+    write(tmp_path / "car" / "train" / "c.ply", 2)
+    write(tmp_path / "car" / "test" / "d.ply", 3)
+
     data = cloud_folder(tmp_path, n_points=32, crops=2)
+    cars = cloud_folder(tmp_path, n_points=32, classes=["car"])
+
     assert data.class_names == ("car", "tree")
-    assert data.train.labels.tolist() == data.test.labels.tolist() == [0, 0, 1, 1]
-    assert cloud_folder(tmp_path, n_points=32, classes=["car"]).class_names == ("car",)
+    assert data.train.labels.tolist() == [0, 0, 1, 1]
+    assert data.test.labels.tolist() == [0, 0, 1, 1]
+    assert cars.class_names == ("car",)
 
 
 def test_cloud_folder_broken_file_is_named(folder):
@@ -115,50 +150,69 @@ def test_cloud_folder_class_in_one_split_is_reported(mesh_layout, capsys):
 
 def test_cloud_folder_surface_reads_modelnet_layout(mesh_layout, capsys):
     data = cloud_folder(mesh_layout, n_points=200, crop="surface", crops=1)
+
     assert data.class_names == ("ball", "box")
     assert data.train.labels.tolist() == [0, 1, 1]
     assert data.test.labels.tolist() == [0, 1]
     assert data.notes == {"train_files": 3, "test_files": 2}
     for clouds in (data.train, data.test):
-        assert clouds.points.shape == (len(clouds.labels), 200, 3)
-        assert (clouds.points.dtype, clouds.labels.dtype) == (torch.float32, torch.int64)
-        torch.testing.assert_close(clouds.points.mean(1), torch.zeros(len(clouds.labels), 3))
+        number = len(clouds.labels)
+        assert clouds.points.shape == (number, 200, 3)
+        assert clouds.points.dtype == torch.float32
+        assert clouds.labels.dtype == torch.int64
+        means = clouds.points.mean(1)
+        torch.testing.assert_close(means, torch.zeros(number, 3))
         farthest = clouds.points.norm(dim=2).amax(1)
-        torch.testing.assert_close(farthest, torch.ones(len(clouds.labels)))
+        torch.testing.assert_close(farthest, torch.ones(number))
     assert capsys.readouterr() == ("", "")  # no progress bar without a terminal
 
 
 def test_cloud_folder_splits_every_class_by_share(tmp_path):
     """ShapeNetCore's layout: SYNSET/*.ply, objects that overlap each other."""
-    for synset, number in (("02691156", 20), ("03001627", 5), ("alone", 1)):
+    numbers = {"02691156": 20, "03001627": 5, "alone": 1}
+    for synset, number in numbers.items():
         for i in range(number):
             write(tmp_path / synset / f"{i:032x}.ply", seed=i, number=60)
-    settings: dict[str, Any] = {"n_points": 50, "crop": "whole", "crops": 1, "test_share": 0.15}
-    data = cloud_folder(tmp_path, **settings)
+    by_share = partial(cloud_folder, n_points=50, crop="whole", crops=1, test_share=0.15)
+
+    data = by_share(tmp_path)
+    again = by_share(tmp_path, seed=0)
+    other = by_share(tmp_path, seed=1)
+
     assert data.class_names == ("02691156", "03001627", "alone")
     assert data.train.points.shape == (17 + 4 + 1, 50, 3)
-    assert data.test.labels.tolist() == [0] * 3 + [1]
+    assert data.test.labels.tolist() == [0, 0, 0, 1]
     assert data.train.sources is None
-    again, other = (cloud_folder(tmp_path, **settings, seed=seed) for seed in (0, 1))
-    assert again.fingerprint == data.fingerprint != other.fingerprint
     assert torch.equal(again.test.points, data.test.points)
+    assert again.fingerprint == data.fingerprint
+    assert other.fingerprint != data.fingerprint
+
+
+def frames_of(clouds, label):
+    """Return the frame numbers of a class, which are the lengths of the boxes less 1."""
+    points = clouds.points[clouds.labels == label]
+    size = points.amax(1) - points.amin(1)
+    lengths = size[:, 2] / size[:, 0]
+    return sorted((lengths - 1).round().int().tolist())
 
 
 def test_cloud_folder_splits_sequences_by_time(tmp_path):
     """Two sequences of boxes that grow with time; frame numbers are not padded."""
     for name, frames in (("crane", 12), ("samba", 10)):
         for frame in range(frames):
-            write_mesh(tmp_path / name / f"mesh_{frame}.ply", box((1, 1, 1 + frame)))
+            path = tmp_path / name / f"mesh_{frame}.ply"
+            write_mesh(path, box((1, 1, 1 + frame)))
         (tmp_path / name / "notes.txt").write_text("no mesh")
-    by_time: dict[str, Any] = {"test_frames": "last", "test_share": 0.25, "gap": 2}
-    data = cloud_folder(tmp_path, 3000, crop="surface", crops=1, **by_time)
+
+    data = cloud_folder(
+        tmp_path, 3000, crop="surface", crops=1, test_frames="last", test_share=0.25, gap=2
+    )
+
     assert data.class_names == ("crane", "samba")
-    found = []
-    for clouds in (data.test, data.train):
-        size = clouds.points.amax(1) - clouds.points.amin(1)
-        times = (size[:, 2] / size[:, 0] - 1).round().int()
-        found += [sorted(times[clouds.labels == label].tolist()) for label in (0, 1)]
-    assert found == [[9, 10, 11], [8, 9], list(range(7)), list(range(6))]
+    assert frames_of(data.test, 0) == [9, 10, 11]
+    assert frames_of(data.test, 1) == [8, 9]
+    assert frames_of(data.train, 0) == [0, 1, 2, 3, 4, 5, 6]
+    assert frames_of(data.train, 1) == [0, 1, 2, 3, 4, 5]
 
 
 def test_cloud_folder_real_sequences(real_data):
@@ -202,7 +256,8 @@ def test_cloud_folder_tiles_score_every_labelled_point_of_a_file_once(tmp_path):
     for seed, number in enumerate((300, 500, 700)):
         points = np.random.default_rng(seed).uniform(0, [40, 30, 2], (number, 3))
         classes = np.where(points[:, 2] < 1, 2, 5)
-        WRITERS[".ply"](tmp_path / f"{seed}.ply", Table(points, {"classification": classes}))
+        table = Table(points, {"classification": classes})
+        WRITERS[".ply"](tmp_path / f"{seed}.ply", table)
 
     data = module.cloud_folder(
         tmp_path, 128, test_frames=None, crop="tiles", crops=None, label="classification"
@@ -213,9 +268,10 @@ def test_cloud_folder_tiles_score_every_labelled_point_of_a_file_once(tmp_path):
         assert clouds.parts is not None
         assert clouds.sources is not None
         for source in clouds.sources.unique():
-            known = clouds.parts[clouds.sources == source] >= 0
-            counts.append(int(known.sum()))
-            assert len(known) == -(-counts[-1] // 128)
+            parts = clouds.parts[clouds.sources == source]
+            known = int((parts >= 0).sum())
+            counts.append(known)
+            assert len(parts) == math.ceil(known / 128)
     assert sorted(counts) == [300, 500, 700]
     assert data.part_names == ("2", "5")
 

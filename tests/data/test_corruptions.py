@@ -18,9 +18,11 @@ GROWN = ("add_global", "add_local", "background")
 
 @pytest.fixture(scope="module")
 def clouds():
-    points = torch.randn(4, N, 3, generator=torch.Generator().manual_seed(3))
-    points = points - points.mean(1, keepdim=True)
-    return Clouds(points / points.norm(dim=2).amax(1)[:, None, None], torch.arange(4))
+    rng = torch.Generator().manual_seed(3)
+    points = torch.randn(4, N, 3, generator=rng)
+    centred = points - points.mean(1, keepdim=True)
+    radii = centred.norm(dim=2).amax(1)
+    return Clouds(centred / radii[:, None, None], torch.arange(4))
 
 
 def rows_in(part, whole):
@@ -50,10 +52,15 @@ def test_every_kind_is_tested():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_draw_depends_on_the_position_of_the_cloud_only(clouds, kind):
-    once = corrupt(clouds, f"{kind}-3")
-    assert torch.equal(corrupt(clouds, f"{kind}-3").points, once.points)
-    first = corrupt(clouds.take(torch.tensor([0, 1])), f"{kind}-3").points
-    assert torch.equal(first, once.points[:2])
+    spec = f"{kind}-3"
+    first_two = clouds.take(torch.tensor([0, 1]))
+
+    once = corrupt(clouds, spec)
+    again = corrupt(clouds, spec)
+    of_first_two = corrupt(first_two, spec)
+
+    assert torch.equal(again.points, once.points)
+    assert torch.equal(of_first_two.points, once.points[:2])
     assert torch.equal(once.labels, clouds.labels)
     assert torch.isfinite(once.points).all()
 
@@ -81,7 +88,9 @@ def test_removal_keeps_a_subset_in_order(clouds, kind):
 
 @pytest.mark.parametrize("kind", GROWN)
 def test_addition_keeps_the_cloud_first(clouds, kind):
-    few, many = (corrupt(clouds, f"{kind}-{severity}").points for severity in (1, 5))
+    few = corrupt(clouds, f"{kind}-1").points
+    many = corrupt(clouds, f"{kind}-5").points
+
     assert torch.equal(many[:, :N], clouds.points)
     assert N < few.shape[1] < many.shape[1]
 
@@ -91,27 +100,43 @@ def test_jitter_has_the_standard_deviation(clouds):
     assert noise.std().item() == pytest.approx(0.05, rel=0.05)
 
 
+def linear_map(before, after):
+    """Return the matrix ``(C, 3)`` that maps one set of points to another best."""
+    return torch.linalg.lstsq(before, after).solution
+
+
 def test_rotation_turns_by_at_most_its_angle(clouds):
     turned = corrupt(clouds, "rotation-2").points
-    for cloud, other in zip(clouds.points, turned, strict=True):
-        turn = torch.linalg.lstsq(cloud, other).solution
-        assert torch.allclose(turn @ turn.T, torch.eye(3), atol=1e-4)
-        assert torch.linalg.det(turn) > 0
-        assert 1 < math.degrees(math.acos((turn.trace() - 1) / 2)) <= 30
+
+    for before, after in zip(clouds.points, turned, strict=True):
+        rotation = linear_map(before, after)
+        assert torch.allclose(rotation @ rotation.T, torch.eye(3), atol=1e-4)
+        assert torch.linalg.det(rotation) > 0
+        cosine = (rotation.trace() - 1) / 2
+        assert 1 < math.degrees(math.acos(cosine)) <= 30
 
 
-def test_scaling_and_shear_are_linear_maps(clouds):
-    for kind, off_diagonal in (("scaling", 0.0), ("shear", 0.25)):
-        for cloud, other in zip(clouds.points, corrupt(clouds, f"{kind}-5").points, strict=True):
-            centred = cloud - cloud.mean(0)
-            mixed = torch.linalg.lstsq(centred, other - other.mean(0)).solution
-            assert torch.allclose(centred @ mixed, other - other.mean(0), atol=1e-4)
-            relative = mixed / mixed.diagonal().mean()
-            rest = relative - relative.diagonal().diag()
-            assert rest.abs().max() <= max(off_diagonal, 1e-3)
-            ratio = mixed.diagonal().max() / mixed.diagonal().min()
-            assert ratio <= (4.01 if kind == "scaling" else 1.001)
-            assert other.norm(dim=1).max().item() == pytest.approx(1, abs=1e-5)
+@pytest.mark.parametrize(
+    ("kind", "largest_off_diagonal", "largest_ratio"),
+    [
+        ("scaling", 1e-3, 4.01),
+        ("shear", 0.25, 1.001),
+    ],
+)
+def test_scaling_and_shear_are_linear_maps(clouds, kind, largest_off_diagonal, largest_ratio):
+    mapped = corrupt(clouds, f"{kind}-5").points
+
+    for before, after in zip(clouds.points, mapped, strict=True):
+        centred = before - before.mean(0)
+        centred_after = after - after.mean(0)
+        matrix = linear_map(centred, centred_after)
+        assert torch.allclose(centred @ matrix, centred_after, atol=1e-4)
+        diagonal = matrix.diagonal()
+        off_diagonal = (matrix - diagonal.diag()) / diagonal.mean()
+        assert off_diagonal.abs().max() <= largest_off_diagonal
+        assert diagonal.max() / diagonal.min() <= largest_ratio
+        farthest = after.norm(dim=1).max().item()
+        assert farthest == pytest.approx(1, abs=1e-5)
 
 
 def test_distortion_moves_neighbours_alike(clouds):
@@ -133,12 +158,19 @@ def test_cutout_cuts_whole_neighbourhoods(clouds):
 
 
 def test_density_changes_inside_or_outside_of_one_neighbourhood(clouds):
+    size = N // 10
     for s in range(4):
-        inside = neighbourhoods(clouds.points[s], N // 10)
-        down, up = (removed(clouds, f"{kind}-1", s) for kind in ("density_down", "density_up"))
-        assert (~inside & down).sum(1).min() == 0
-        assert (inside & up).sum(1).min() == 0
-        assert down.sum() == up.sum() == round(0.75 * (N // 10))
+        inside = neighbourhoods(clouds.points[s], size)
+
+        down = removed(clouds, "density_down-1", s)
+        up = removed(clouds, "density_up-1", s)
+
+        removed_outside = (~inside & down).sum(1)
+        removed_inside = (inside & up).sum(1)
+        assert removed_outside.min() == 0
+        assert removed_inside.min() == 0
+        assert down.sum() == round(0.75 * size)
+        assert up.sum() == round(0.75 * size)
 
 
 def test_local_drop_is_closer_together_than_global_drop(clouds):
@@ -150,16 +182,18 @@ def test_local_drop_is_closer_together_than_global_drop(clouds):
 
 
 def test_added_points_are_where_they_should_be(clouds):
-    ball, local, cube = (
-        corrupt(clouds, f"{kind}-5").points[:, N:]
-        for kind in ("add_global", "add_local", "background")
-    )
-    assert ball.norm(dim=2).max() <= 1
-    assert ball.norm(dim=2).pow(3).mean().item() == pytest.approx(0.5, abs=0.1)
+    ball = corrupt(clouds, "add_global-5").points[:, N:]
+    local = corrupt(clouds, "add_local-5").points[:, N:]
+    cube = corrupt(clouds, "background-5").points[:, N:]
+
+    radii = ball.norm(dim=2)
+    assert radii.max() <= 1
+    volumes = radii.pow(3)
+    assert volumes.mean().item() == pytest.approx(0.5, abs=0.1)
     assert cube.abs().max() <= 1
     assert cube.norm(dim=2).max() > 1
-    distance = torch.cdist(local, clouds.points)
-    assert distance.amin(2).mean() < 0.2
+    to_cloud = torch.cdist(local, clouds.points).amin(2)
+    assert to_cloud.mean() < 0.2
 
 
 @pytest.mark.parametrize(
@@ -190,25 +224,33 @@ def test_parts_are_kept_where_points_were_only_moved(clouds, kind):
 
 
 NORMALS = PointChannels(
-    [Channel("intensity"), Channel("normal_x"), Channel("normal_y"), Channel("normal_z")]
+    [
+        Channel("intensity"),
+        Channel("normal_x"),
+        Channel("normal_y"),
+        Channel("normal_z"),
+    ]
 )
 
 
 def with_channels(clouds):
     """Points of spheres with their rows as intensity, and their normals."""
-    places = torch.nn.functional.normalize(clouds.points, dim=2)
-    rows = torch.arange(N).expand(4, N)[..., None].float()
-    return clouds._replace(points=torch.cat([places, rows, places], 2))
+    normals = torch.nn.functional.normalize(clouds.points, dim=2)
+    rows = torch.arange(N).expand(4, N)
+    intensity = rows[..., None].float()
+    return clouds._replace(points=torch.cat([normals, intensity, normals], 2))
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_coordinates_are_corrupted_as_without_channels(clouds, kind):
+    spec = f"{kind}-3"
     given = with_channels(clouds)
-    bare = given._replace(points=given.points[..., :3].contiguous())
+    coordinates = given.points[..., :3].contiguous()
 
-    corrupted = corrupt(given, f"{kind}-3", NORMALS).points
+    corrupted = corrupt(given, spec, NORMALS).points
 
-    torch.testing.assert_close(corrupted[..., :3], corrupt(bare, f"{kind}-3").points)
+    without_channels = corrupt(given._replace(points=coordinates), spec).points
+    torch.testing.assert_close(corrupted[..., :3], without_channels)
 
 
 @pytest.mark.parametrize("kind", SHRUNK)
@@ -227,9 +269,12 @@ def test_added_points_have_the_channels_of_points_of_the_cloud(clouds, kind):
 
     corrupted = corrupt(given, f"{kind}-3", NORMALS).points
 
-    for cloud, before in zip(corrupted, given.points, strict=True):
-        assert torch.equal(cloud[:N], before)
-        assert torch.equal(cloud[N:, 4:], before[cloud[N:, 3].long(), 4:])
+    for after, before in zip(corrupted, given.points, strict=True):
+        added = after[N:]
+        rows = added[:, 3].long()
+        normals = before[rows, 4:]
+        assert torch.equal(after[:N], before)
+        assert torch.equal(added[:, 4:], normals)
 
 
 def test_rotation_turns_normals(clouds):
@@ -245,11 +290,14 @@ def test_linear_map_keeps_normals_normal_to_the_surface(clouds, kind):
     corrupted = corrupt(given, f"{kind}-5", NORMALS).points
 
     # Tangents of the sphere, mapped as differences of points, stay orthogonal to the normals.
+    direction = torch.tensor([0.3, 0.5, 0.8]).expand(N, 3)
     for before, after in zip(given.points, corrupted, strict=True):
-        affine = torch.linalg.lstsq(
-            torch.cat([before[:, :3], torch.ones(N, 1)], 1), after[:, :3]
-        ).solution
-        tangents = torch.linalg.cross(before[:, :3], torch.tensor([0.3, 0.5, 0.8]).expand(N, 3))
+        sphere = before[:, :3]
+        homogeneous = torch.cat([sphere, torch.ones(N, 1)], 1)
+        affine = linear_map(homogeneous, after[:, :3])
+        tangents = torch.linalg.cross(sphere, direction)
         mapped = tangents @ affine[:3]
-        assert (mapped * after[:, 4:]).sum(1).abs().max() < 1e-4
-        torch.testing.assert_close(after[:, 4:].norm(dim=1), torch.ones(N))
+        normals = after[:, 4:]
+        products = (mapped * normals).sum(1)
+        assert products.abs().max() < 1e-4
+        torch.testing.assert_close(normals.norm(dim=1), torch.ones(N))

@@ -1,3 +1,4 @@
+import itertools
 import math
 
 import pytest
@@ -26,14 +27,25 @@ def test_loader_without_shuffle_keeps_order_also_after_an_interrupted_iteration(
     assert len(loader) == 3
 
 
+def points_of(loader):
+    return torch.cat([batch.points for batch in loader])
+
+
 def test_loader_order_depends_on_seed_and_epoch():
-    first, second = (CloudLoader(clouds(), 4, shuffle=True, seed=5) for _ in range(2))
-    epochs = [labels(first) for _ in range(3)]
-    assert epochs[0] != epochs[1] != epochs[2]
-    second.set_epoch(2)
-    assert labels(second) == epochs[2]
-    assert labels(CloudLoader(clouds(), 4, shuffle=True, seed=6)) != epochs[0]
-    assert sorted(label for batch in epochs[0] for label in batch) == list(range(10))
+    loader = CloudLoader(clouds(), 4, shuffle=True, seed=5)
+    same_seed = CloudLoader(clouds(), 4, shuffle=True, seed=5)
+    other_seed = CloudLoader(clouds(), 4, shuffle=True, seed=6)
+
+    first = labels(loader)
+    second = labels(loader)
+    third = labels(loader)
+
+    assert first != second
+    assert second != third
+    assert sorted(itertools.chain(*first)) == [0, 1, 2, 3, 4, 5, 6, 7, 8, 9]
+    assert labels(other_seed) != first
+    same_seed.set_epoch(2)
+    assert labels(same_seed) == third
 
 
 def test_loader_drop_last_keeps_only_batch():
@@ -42,11 +54,17 @@ def test_loader_drop_last_keeps_only_batch():
 
 
 def test_loader_augments_anew_in_every_batch_and_epoch():
-    loader = CloudLoader(clouds(), 4, augment=Augmentation(jitter=0.01), seed=1)
-    first, second = (torch.cat([batch.points for batch in loader]) for _ in range(2))
+    augment = Augmentation(jitter=0.01)
+    loader = CloudLoader(clouds(), 4, augment=augment, seed=1)
+
+    first = points_of(loader)
+    second = points_of(loader)
+
     assert (first != second).any(2).all()
     noise = first - clouds().points
-    assert not torch.allclose(noise[:4], noise[4:8], atol=1e-4)
+    first_batch = noise[:4]
+    second_batch = noise[4:8]
+    assert not torch.allclose(first_batch, second_batch, atol=1e-4)
 
 
 def test_augmentation_jitter_is_clipped(rng, monkeypatch):
@@ -60,46 +78,63 @@ def test_augmentation_jitter_is_clipped(rng, monkeypatch):
 
 def test_augmentation_stretches_and_shifts_every_axis_of_a_cloud(rng):
     points = clouds(300).points
-    changed = Augmentation(stretch=1.5, shift=0.2)(points, rng)
-    scale = (changed[:, 1] - changed[:, 0]) / (points[:, 1] - points[:, 0])
+    augment = Augmentation(stretch=1.5, shift=0.2)
+
+    changed = augment(points, rng)
+
+    edge = points[:, 1] - points[:, 0]
+    changed_edge = changed[:, 1] - changed[:, 0]
+    scale = changed_edge / edge
     offset = changed[:, 0] - scale * points[:, 0]
-    torch.testing.assert_close(
-        changed, points * scale[:, None] + offset[:, None], atol=1e-3, rtol=0
-    )
-    for drawn, low, high in ((scale, 1 / 1.5, 1.5), (offset, -0.2, 0.2)):
-        assert low - 1e-3 < drawn.min() < low + 0.05
-        assert high - 0.05 < drawn.max() < high + 1e-3
-        assert drawn.mean().item() == pytest.approx((low + high) / 2, abs=0.05)
-        of_axes = torch.corrcoef(drawn.T) - torch.eye(3)
-        assert of_axes.abs().max() < 0.2  # every axis has factors and shifts of its own
+    expected = points * scale[:, None] + offset[:, None]
+    torch.testing.assert_close(changed, expected, atol=1e-3, rtol=0)
+    assert_drawn_for_every_axis(scale, 1 / 1.5, 1.5)
+    assert_drawn_for_every_axis(offset, -0.2, 0.2)
+
+
+def assert_drawn_for_every_axis(drawn, low, high):
+    """Assert numbers that fill a range evenly and differ between the axes."""
+    assert low - 1e-3 < drawn.min() < low + 0.05
+    assert high - 0.05 < drawn.max() < high + 1e-3
+    middle = (low + high) / 2
+    assert drawn.mean().item() == pytest.approx(middle, abs=0.05)
+    between_axes = torch.corrcoef(drawn.T) - torch.eye(3)
+    assert between_axes.abs().max() < 0.2
 
 
 def test_augmentation_equals_written_out_formulas():
     points = clouds(300).points
+    augment = Augmentation(rotate_up=True, jitter=0.04)
+
+    augmented = augment(points, torch.Generator().manual_seed(3))
+
     rng = torch.Generator().manual_seed(3)
-    got = Augmentation(rotate_up=True, jitter=0.04)(points, rng)
-    rng.manual_seed(3)
     angles = torch.rand(300, generator=rng) * 2 * math.pi
     noise = 0.04 * torch.randn(points.shape, generator=rng)
     x, y, z = points.unbind(2)
     cos = angles.cos()[:, None]
     sin = angles.sin()[:, None]
-    turned = torch.stack([x * cos - z * sin, y, x * sin + z * cos], 2)
-    torch.testing.assert_close(got, turned + noise.clamp(-0.2, 0.2))
+    turned_x = x * cos - z * sin
+    turned_z = x * sin + z * cos
+    turned = torch.stack([turned_x, y, turned_z], 2)
+    torch.testing.assert_close(augmented, turned + noise.clamp(-0.2, 0.2))
 
 
 @pytest.mark.parametrize("up", ["x", "y", "z"])
 def test_augmentation_turns_about_its_vertical_axis(up):
     points = clouds(20).points
     axis = "xyz".index(up)
-    turned = Augmentation(rotate_up=up)(points, torch.Generator().manual_seed(3))
-    torch.testing.assert_close(turned[..., axis], points[..., axis])
     # As about y, after the axes were moved in a circle, which mirrors nothing.
     moved = points.roll(1 - axis, 2)
-    about_y = Augmentation(rotate_up=True)(moved, torch.Generator().manual_seed(3))
-    torch.testing.assert_close(turned, about_y.roll(axis - 1, 2))
+    about_y = Augmentation(rotate_up=True)
+    about_up = Augmentation(rotate_up=up)
+
+    turned = about_up(points, torch.Generator().manual_seed(3))
+
+    turned_about_y = about_y(moved, torch.Generator().manual_seed(3))
+    torch.testing.assert_close(turned[..., axis], points[..., axis])
+    torch.testing.assert_close(turned, turned_about_y.roll(axis - 1, 2))
     assert not torch.allclose(turned, points)
-    assert torch.equal(Augmentation()(points, torch.Generator()), points)
 
 
 def test_augmentation_invalid_argument_raises():
@@ -109,9 +144,20 @@ def test_augmentation_invalid_argument_raises():
         Augmentation(jitter=-1.0)
 
 
+def test_augmentation_without_settings_changes_nothing():
+    points = clouds(20).points
+
+    augmented = Augmentation()(points, torch.Generator())
+
+    assert torch.equal(augmented, points)
+
+
 def drawn(loader):
     """The number that the task draws for each cloud, by label."""
-    return {label: number for batch in loader for label, number in batch}
+    numbers = {}
+    for batch in loader:
+        numbers.update(batch)
+    return numbers
 
 
 @pytest.mark.parametrize("shuffle", [False, True])
@@ -119,26 +165,39 @@ def test_loader_task_draws_by_cloud_and_in_training_by_epoch(shuffle):
     known = clouds().points
 
     def make_batch(points, generators):
-        numbers = [float(torch.rand((), generator=one)) for one in generators]
-        rows = [int((known == cloud).all((1, 2)).nonzero()) for cloud in points]
-        return list(zip(rows, numbers, strict=True))
+        labelled = []
+        for cloud, rng in zip(points, generators, strict=True):
+            is_cloud = (known == cloud).all((1, 2))
+            number = float(torch.rand((), generator=rng))
+            labelled.append((int(is_cloud.nonzero()), number))
+        return labelled
 
     def loader(batch_size=4, seed=5):
         return CloudLoader(clouds(), batch_size, shuffle, make_batch=make_batch, seed=seed)
 
-    first = loader()
-    epochs = [drawn(first), drawn(first)]
+    def numbers_of_stream(*stream):
+        numbers = {}
+        for label in range(10):
+            rng = generator(*stream, label)
+            numbers[label] = float(torch.rand((), generator=rng))
+        return numbers
+
+    first_loader = loader()
+    first_epoch = drawn(first_loader)
+    second_epoch = drawn(first_loader)
+
     # Test pairs stay the same for ever, training pairs for a seed and an epoch.
-    streams = [(12, 5, epoch) if shuffle else (11, 5) for epoch in range(2)]
-    assert epochs == [
-        {row: float(torch.rand((), generator=generator(*stream, row))) for row in range(10)}
-        for stream in streams
-    ]
-    assert (epochs[0] == epochs[1]) != shuffle
-    assert drawn(loader(batch_size=3)) == epochs[0]
-    assert drawn(loader(seed=6)) != epochs[0]
-    if not shuffle:
-        assert loader().batch_of(torch.tensor([7, 2])) == [(row, epochs[0][row]) for row in (7, 2)]
+    if shuffle:
+        assert first_epoch == numbers_of_stream(12, 5, 0)
+        assert second_epoch == numbers_of_stream(12, 5, 1)
+        assert second_epoch != first_epoch
+    else:
+        assert first_epoch == numbers_of_stream(11, 5)
+        assert second_epoch == first_epoch
+        batch = loader().batch_of(torch.tensor([7, 2]))
+        assert batch == [(7, first_epoch[7]), (2, first_epoch[2])]
+    assert drawn(loader(batch_size=3)) == first_epoch
+    assert drawn(loader(seed=6)) != first_epoch
 
 
 def loaders(number, processes, batch_size=8, **extra):
@@ -150,28 +209,39 @@ def loaders(number, processes, batch_size=8, **extra):
 
 @pytest.mark.parametrize("number", [16, 29])
 def test_loader_shares_of_training_batch_form_whole_batch(number):
-    settings = {"shuffle": True, "drop_last": True, "augment": Augmentation(True, 0.1)}
+    augment = Augmentation(True, 0.1)
+    settings = {"shuffle": True, "drop_last": True, "augment": augment}
     (alone,) = loaders(number, 1, **settings)
-    for whole, *shares in zip(alone, *loaders(number, 2, **settings), strict=True):
-        assert len({len(share.points) for share in shares}) == 1
-        assert torch.equal(torch.cat([share.points for share in shares]), whole.points)
-        assert torch.equal(torch.cat([share.labels for share in shares]), whole.labels)
+    first, second = loaders(number, 2, **settings)
+
+    for whole, left, right in zip(alone, first, second, strict=True):
+        assert len(left.points) == len(right.points)
+        assert torch.equal(torch.cat([left.points, right.points]), whole.points)
+        assert torch.equal(torch.cat([left.labels, right.labels]), whole.labels)
 
 
 def test_loader_indivisible_batch_drops_last_clouds():
-    first, second = (list(loader) for loader in loaders(7, 2, shuffle=True))
-    assert [len(batch.points) for batch in (*first, *second)] == [3, 3]
+    first, second = loaders(7, 2, shuffle=True)
+
+    (first_batch,) = first
+    (second_batch,) = second
+
+    assert len(first_batch.points) == 3
+    assert len(second_batch.points) == 3
 
 
 @pytest.mark.parametrize("processes", [1, 2, 3, 4])
 def test_loader_test_split_scores_each_cloud_once(processes):
     for number in range(processes, 60):
-        shares = [list(loader) for loader in loaders(number, processes)]
-        assert {len(share) for share in shares} == {-(-number // 8)}
-        sizes = [len(batch.points) for share in shares for batch in share]
-        assert min(sizes) > 0
-        labels = torch.cat([batch.labels for share in shares for batch in share])
-        assert torch.equal(labels.sort().values, torch.arange(number))
+        batches_of_each = -(-number // 8)
+        seen = []
+        for loader in loaders(number, processes):
+            batches = list(loader)
+            assert len(batches) == batches_of_each
+            for batch in batches:
+                assert len(batch.points) > 0
+                seen.extend(batch.labels.tolist())
+        assert sorted(seen) == list(range(number))
 
 
 INTENSITY_AND_NORMALS = PointChannels(
@@ -181,31 +251,46 @@ INTENSITY_AND_NORMALS = PointChannels(
 
 def sphere(rng):
     """Points of unit spheres with an intensity and their normals, which are the points."""
-    places = torch.nn.functional.normalize(torch.randn(2, 50, 3, generator=rng), dim=2)
-    return torch.cat([places, torch.rand(2, 50, 1, generator=rng), places], 2)
+    directions = torch.randn(2, 50, 3, generator=rng)
+    normals = torch.nn.functional.normalize(directions, dim=2)
+    intensity = torch.rand(2, 50, 1, generator=rng)
+    return torch.cat([normals, intensity, normals], 2)
+
+
+def split_channels(points):
+    """Return coordinates, intensities and normals."""
+    return points[..., :3], points[..., 3], points[..., 4:]
 
 
 @pytest.mark.parametrize("up", ["x", "y", "z"])
 def test_augmentation_turns_normals_with_the_cloud(up, rng):
     points = sphere(rng)
+    augment = Augmentation(rotate_up=up)
 
-    turned = Augmentation(rotate_up=up)(points, generator(1), INTENSITY_AND_NORMALS)
+    turned = augment(points, generator(1), INTENSITY_AND_NORMALS)
 
-    torch.testing.assert_close(turned[..., 4:], turned[..., :3])
-    assert torch.equal(turned[..., 3], points[..., 3])
-    assert not torch.allclose(turned[..., :3], points[..., :3])
+    coordinates, intensity, _ = split_channels(points)
+    turned_coordinates, turned_intensity, turned_normals = split_channels(turned)
+    torch.testing.assert_close(turned_normals, turned_coordinates)
+    assert torch.equal(turned_intensity, intensity)
+    assert not torch.allclose(turned_coordinates, coordinates)
 
 
 def test_augmentation_keeps_normals_normal_to_a_stretched_surface(rng):
     points = sphere(rng)
+    augment = Augmentation(stretch=3.0)
 
-    stretched = Augmentation(stretch=3.0)(points, generator(1), INTENSITY_AND_NORMALS)
+    stretched = augment(points, generator(1), INTENSITY_AND_NORMALS)
 
+    coordinates, intensity, _ = split_channels(points)
+    stretched_coordinates, stretched_intensity, stretched_normals = split_channels(stretched)
+    factors = stretched_coordinates.abs() / coordinates.abs()
+    half_axes = factors.median(1, keepdim=True).values
     # The normal of an ellipsoid with the half axes a is x / a².
-    axes = stretched[..., :3].abs().div(points[..., :3].abs()).median(1, keepdim=True).values
-    expected = torch.nn.functional.normalize(stretched[..., :3] / axes.square(), dim=2)
-    torch.testing.assert_close(stretched[..., 4:], expected, atol=1e-5, rtol=1e-4)
-    assert torch.equal(stretched[..., 3], points[..., 3])
+    gradient = stretched_coordinates / half_axes.square()
+    expected = torch.nn.functional.normalize(gradient, dim=2)
+    torch.testing.assert_close(stretched_normals, expected, atol=1e-5, rtol=1e-4)
+    assert torch.equal(stretched_intensity, intensity)
 
 
 def test_augmentation_moves_coordinates_as_without_channels(rng):

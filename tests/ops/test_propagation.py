@@ -54,11 +54,12 @@ def test_ragged_clouds_equal_clouds_one_by_one(rng):
     first = torch.rand(40, 3, generator=rng)
     second = torch.rand(25, 3, generator=rng)
     labels = torch.randint(9, (14,), generator=rng)
-    batch = torch.tensor([0] * 40 + [1] * 25)
+    points = torch.cat([first, second])
+    batch = torch.arange(2).repeat_interleave(torch.tensor([40, 25]))
     sampled = torch.cat([first[:8], second[:6]])
-    sampled_batch = torch.tensor([0] * 8 + [1] * 6)
+    sampled_batch = torch.arange(2).repeat_interleave(torch.tensor([8, 6]))
 
-    flat = propagation_map(torch.cat([first, second]), sampled, 3, batch, sampled_batch)
+    flat = propagation_map(points, sampled, 3, batch, sampled_batch)
 
     of_first = propagate(labels[:8], propagation_map(first, first[:8], 3))
     of_second = propagate(labels[8:], propagation_map(second, second[:6], 3))
@@ -73,8 +74,9 @@ def test_batch_equals_clouds_one_by_one(cloud, rng):
 
     carried = propagate(values, propagation_map(points, samples, 2))
 
-    alone = propagation_map(points[cloud], samples[cloud], 2)
-    assert torch.equal(carried[cloud], propagate(values[cloud], alone))
+    map_alone = propagation_map(points[cloud], samples[cloud], 2)
+    carried_alone = propagate(values[cloud], map_alone)
+    assert torch.equal(carried[cloud], carried_alone)
 
 
 @pytest.mark.parametrize("kind", LABELS)
@@ -89,10 +91,11 @@ def test_labels_stay_exact(kind, k, rng):
     carried = propagate(labels, made)
 
     assert carried.dtype == labels.dtype
-    for row, weights, label in zip(made.rows.tolist(), made.weights.tolist(), carried, strict=True):
-        votes = dict.fromkeys(labels[row], 0.0)
-        for neighbour, weight in zip(labels[row], weights, strict=True):
-            votes[neighbour] += weight
+    for row, weights, label in zip(made.rows, made.weights, carried, strict=True):
+        labels_near = labels[row.numpy()]
+        votes = dict.fromkeys(labels_near, 0.0)
+        for neighbour, weight in zip(labels_near, weights, strict=True):
+            votes[neighbour] += float(weight)
         assert votes[label] == pytest.approx(max(votes.values()))
 
 
@@ -113,10 +116,13 @@ def test_columns_vote_one_by_one_and_colours_are_averaged_on_request():
 def test_gradients_flow_to_features(rng):
     points = torch.rand(9, 3, generator=rng, dtype=torch.float64)
     sampled = torch.rand(6, 3, generator=rng, dtype=torch.float64)
-    values = torch.rand(6, 2, generator=rng, dtype=torch.float64, requires_grad=True)
+    features = torch.rand(6, 2, generator=rng, dtype=torch.float64, requires_grad=True)
     made = propagation_map(points, sampled, 3)
 
-    assert torch.autograd.gradcheck(lambda features: propagate(features, made), values)
+    def carried(features):
+        return propagate(features, made)
+
+    assert torch.autograd.gradcheck(carried, features)
 
 
 ROWS = np.zeros((5, 2), np.int32)
@@ -125,22 +131,40 @@ NO_SUCH_MAP = "is no map"
 OUT_OF_RANGE = "rows must be from -1 to 2, got"
 
 
+M = np.array(3)
+
+
 @pytest.mark.parametrize(
     ("arrays", "said"),
     [
-        ({"m": np.array(3)}, r"is no map: .*rows \(N, k\) and m of at least 1, got m"),
+        ({"m": M}, r"is no map: .*rows \(N, k\) and m of at least 1, got m"),
         ({"rows": ROWS}, NO_SUCH_MAP),
-        ({"rows": ROWS / 2, "m": np.array(3)}, "must hold whole numbers"),
-        ({"rows": ROWS[0], "m": np.array(3)}, NO_SUCH_MAP),
-        ({"rows": ROWS[:, :0], "m": np.array(3)}, NO_SUCH_MAP),
+        ({"rows": ROWS / 2, "m": M}, "must hold whole numbers"),
+        ({"rows": ROWS[0], "m": M}, NO_SUCH_MAP),
+        ({"rows": ROWS[:, :0], "m": M}, NO_SUCH_MAP),
         ({"rows": ROWS, "m": np.array([3, 3])}, NO_SUCH_MAP),
-        ({"rows": ROWS, "m": np.array(-3)}, "m of at least 1"),
-        ({"rows": COLUMN + 3, "m": np.array(3)}, f"{OUT_OF_RANGE} 3 to 3"),
-        ({"rows": COLUMN - 2, "m": np.array(3)}, f"{OUT_OF_RANGE} -2"),
-        ({"rows": COLUMN - 1, "m": np.array(3)}, "5 points have no finite coordinates.* fill=0"),
+        ({"rows": ROWS, "m": -M}, "m of at least 1"),
+        ({"rows": COLUMN + 3, "m": M}, f"{OUT_OF_RANGE} 3 to 3"),
+        ({"rows": COLUMN - 2, "m": M}, f"{OUT_OF_RANGE} -2"),
+        ({"rows": COLUMN - 1, "m": M}, "5 points have no finite coordinates.* fill=0"),
         ({"rows": COLUMN, "m": np.array(4)}, r"each of 4 sampled points, shape \(4,\), got"),
-        ({"rows": ROWS, "m": np.array(3)}, "weights must be finite"),
-        ({"rows": ROWS, "m": np.array(3), "weights": ROWS * np.nan}, "weights must be finite"),
+        ({"rows": ROWS, "m": M}, "weights must be finite"),
+        ({"rows": ROWS, "m": M, "weights": ROWS * np.nan}, "weights must be finite"),
+    ],
+    ids=[
+        "no rows",
+        "no m",
+        "half rows",
+        "flat rows",
+        "no columns",
+        "two m",
+        "negative m",
+        "rows too large",
+        "rows too small",
+        "rows of points without coordinates",
+        "other m than labels",
+        "no weights",
+        "weights not finite",
     ],
 )
 def test_bad_map_gets_one_line(arrays, said, tmp_path):
@@ -201,9 +225,11 @@ def test_wrong_argument_gets_one_line(arguments, said):
 @pytest.mark.parametrize("k", [1, 2, 5])
 def test_map_breaks_ties_by_the_lowest_row(k):
     axis = np.arange(6.0)
-    grid = np.stack(np.meshgrid(axis, axis, axis), -1).reshape(-1, 3)
+    x, y, z = np.meshgrid(axis, axis, axis)
+    grid = np.column_stack([x.ravel(), y.ravel(), z.ravel()])
     third = grid[::3]
-    sampled = np.concatenate([third, third])[::-1].copy()
+    twice = np.concatenate([third, third])
+    sampled = twice[::-1].copy()
     middles = grid + 0.5
 
     rows = propagation_map(middles, sampled, k).rows.numpy()
@@ -228,15 +254,18 @@ def test_mean_of_64_bits_does_not_wrap(kind):
     info = np.iinfo(kind)
     values = np.array([info.max, info.max - 1, info.min, info.min + 2, 2**60 + 1], kind)
     rows = torch.tensor([[0, 1], [1, 0], [2, 3], [0, 2], [3, 1], [4, 0]])
-    weights = torch.tensor([[0.5, 0.5], [0.75, 0.25], [0.5, 0.5], [0.5, 0.5], [0.25, 0.75], [1, 0]])
+    first_weight = torch.tensor([0.5, 0.75, 0.5, 0.5, 0.25, 1.0])
+    weights = torch.stack([first_weight, 1 - first_weight], dim=1)
+    made = PropagationMap(rows, weights, 5)
 
-    means = propagate(values, PropagationMap(rows, weights, 5), mean=True)
+    means = propagate(values, made, mean=True)
 
     assert means.dtype == kind
-    for row, weight, mean in zip(rows.tolist(), weights.tolist(), means, strict=True):
-        expected = exact_mean(values[row], weight)
+    for row, weight, mean in zip(rows.numpy(), weights.tolist(), means, strict=True):
+        averaged = values[row]
+        expected = exact_mean(averaged, weight)
         assert abs(int(mean) - expected) <= 2**10  # float64 has 53 bits of the difference
-        assert min(values[row]) <= mean <= max(values[row])
+        assert min(averaged) <= mean <= max(averaged)
 
 
 @pytest.mark.parametrize("kind", [np.uint16, np.uint32, np.uint64, np.int64, np.float32])
@@ -244,16 +273,16 @@ def test_mean_of_64_bits_does_not_wrap(kind):
 def test_fill_is_the_value_of_points_without_coordinates(kind, k):
     largest = 9 if kind is np.float32 else np.iinfo(kind).max
     values = np.array([5, 6, largest], kind)
-    rows = torch.tensor([[0, 1], [-1, -1], [2, 1]])[:, :k]
+    rows = torch.tensor([[0, 1], [-1, -1], [2, 1]])
     weights = torch.full((3, k), 1 / k)
+    made = PropagationMap(rows[:, :k], weights, 3)
 
-    carried = propagate(values, PropagationMap(rows, weights, 3), fill=7)
+    carried = propagate(values, made, fill=7)
 
     assert carried.dtype == kind
     assert carried[1] == 7
     if k == 1:
-        assert carried[0] == 5
-        assert carried[2] == largest
+        assert carried.tolist() == [5, 7, largest]
 
 
 def test_fill_that_the_type_cannot_hold_is_refused():
@@ -265,9 +294,13 @@ def test_fill_that_the_type_cannot_hold_is_refused():
 
 def test_map_file_with_big_endian_arrays_is_read(tmp_path):
     path = tmp_path / "map.npz"
-    np.savez(path, rows=np.array([[1], [0]], ">i4"), m=np.array(2, ">i8"))
+    rows = np.array([[1], [0]], ">i4")
+    m = np.array(2, ">i8")
+    np.savez(path, rows=rows, m=m)
 
-    assert propagate(np.array([7, 8]), path).tolist() == [8, 7]
+    carried = propagate(np.array([7, 8]), path)
+
+    assert carried.tolist() == [8, 7]
 
 
 @pytest.mark.parametrize("name", ["rows", "weights", "m"])

@@ -5,24 +5,31 @@ from mops_lightning.ops import attention, sampling_matrix
 from mops_lightning.ops.sampling_matrix import SamplingMatrix
 
 
+def drawn_normal(rng, *shape, dtype=torch.float64):
+    return torch.randn(shape, generator=rng, dtype=dtype)
+
+
 def random_matrix(batch=2, n=37, m=11, c=8, tau=0.3, dtype=torch.float64, seed=0):
     rng = torch.Generator().manual_seed(seed)
-    queries = torch.randn(m, c, generator=rng, dtype=dtype)
-    keys = torch.randn(batch, n, c, generator=rng, dtype=dtype)
-    points = torch.randn(batch, n, 3, generator=rng, dtype=dtype)
-    return SamplingMatrix(queries, keys, tau), points
+    queries = drawn_normal(rng, m, c, dtype=dtype)
+    keys = drawn_normal(rng, batch, n, c, dtype=dtype)
+    points = drawn_normal(rng, batch, n, 3, dtype=dtype)
+    matrix = SamplingMatrix(queries, keys, tau)
+    return matrix, points
 
 
 def plain_dense(matrix):
     """The paper's Eq. (5), entry by entry."""
-    batch, n, _ = matrix.keys.shape
-    result = torch.empty(batch, n, len(matrix.queries), dtype=matrix.keys.dtype)
-    for b in range(batch):
-        for j, query in enumerate(matrix.queries):
-            logits = torch.stack([(query * key).sum() / matrix.tau for key in matrix.keys[b]])
+    clouds = []
+    for keys in matrix.keys:
+        columns = []
+        for query in matrix.queries:
+            products = [(query * key).sum() for key in keys]
+            logits = torch.stack(products) / matrix.tau
             shares = (logits - logits.max()).exp()
-            result[b, :, j] = shares / shares.sum()
-    return result
+            columns.append(shares / shares.sum())
+        clouds.append(torch.stack(columns, 1))
+    return torch.stack(clouds)
 
 
 @pytest.fixture(params=["dense", "streamed"])
@@ -57,23 +64,30 @@ def test_sample_is_streamed_above_a_number_of_entries(monkeypatch):
 
 def test_sample_gradients_equal_dense(path):
     matrix, points = random_matrix()
-    inputs = [t.clone().requires_grad_() for t in (matrix.queries, matrix.keys, points)]
-    weight = torch.randn(2, 11, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
-    sampled = SamplingMatrix(inputs[0], inputs[1], 0.3).sample(inputs[2])
-    got = torch.autograd.grad((sampled * weight).sum(), inputs)
-    plain = SamplingMatrix(inputs[0], inputs[1], 0.3).dense().mT @ inputs[2]
-    want = torch.autograd.grad((plain * weight).sum(), inputs)
-    for a, b in zip(got, want, strict=True):
-        torch.testing.assert_close(a, b)
+    queries = matrix.queries.clone().requires_grad_()
+    keys = matrix.keys.clone().requires_grad_()
+    points.requires_grad_()
+    inputs = (queries, keys, points)
+    weight = drawn_normal(torch.Generator().manual_seed(5), 2, 11, 3)
+
+    sampled = SamplingMatrix(queries, keys, 0.3).sample(points)
+    plain = SamplingMatrix(queries, keys, 0.3).dense().mT @ points
+
+    gradients = torch.autograd.grad((sampled * weight).sum(), inputs)
+    expected = torch.autograd.grad((plain * weight).sum(), inputs)
+    torch.testing.assert_close(gradients, expected)
 
 
 def test_sample_large_logits_do_not_overflow(path):
     matrix, points = random_matrix(tau=1e-4, dtype=torch.float32)
+
     sampled = matrix.sample(points)
+
     assert torch.isfinite(sampled).all()
     # At this temperature every column has one winner.
-    winners = (matrix.keys @ matrix.queries.T).argmax(1)
-    expected = points.gather(1, winners[..., None].expand(-1, -1, 3))
+    logits = matrix.keys @ matrix.queries.T
+    winners = logits.argmax(1)
+    expected = torch.take_along_dim(points, winners[..., None], 1)
     torch.testing.assert_close(sampled, expected, atol=1e-3, rtol=0)
 
 
@@ -81,14 +95,20 @@ def test_sample_float32_streamed_is_as_accurate_as_dense():
     matrix, points = random_matrix(batch=1, n=5000, m=1500, c=16, tau=0.1, dtype=torch.float32)
     assert matrix.keys.shape[1] * len(matrix.queries) > attention.BLOCKS["cpu"].dense
     exact = SamplingMatrix(matrix.queries.double(), matrix.keys.double(), matrix.tau)
-    logits = exact.queries @ exact.keys[0].mT / exact.tau
+    expected = exact.dense().mT @ points.double()
+
+    streamed = matrix.sample(points)
+    plain = matrix.dense().mT @ points
+
     # Rounding error of a logit, and so of the logarithm of a weight, in float32.
-    digits = float(logits.abs().max()) * torch.finfo(torch.float32).eps
-    want = exact.dense().mT @ points.double()
-    streamed, plain = matrix.sample(points).double(), (matrix.dense().mT @ points).double()
-    torch.testing.assert_close(streamed, want, atol=digits, rtol=0)
-    torch.testing.assert_close(plain, want, atol=digits, rtol=0)
-    assert (streamed - want).abs().mean() <= 1.5 * (plain - want).abs().mean()
+    logits = exact.queries @ exact.keys[0].mT / exact.tau
+    largest_logit = float(logits.abs().max())
+    tolerance = largest_logit * torch.finfo(torch.float32).eps
+    torch.testing.assert_close(streamed.double(), expected, atol=tolerance, rtol=0)
+    torch.testing.assert_close(plain.double(), expected, atol=tolerance, rtol=0)
+    error_of_streamed = (streamed.double() - expected).abs().mean()
+    error_of_plain = (plain.double() - expected).abs().mean()
+    assert error_of_streamed <= 1.5 * error_of_plain
 
 
 @pytest.mark.parametrize("threshold", [0.0, 0.05, 0.3, 0.9])
@@ -96,11 +116,16 @@ def test_sparse_drops_and_renormalises(path, threshold):
     matrix, _ = random_matrix()
     dense = plain_dense(matrix)
     kept = torch.where(dense >= threshold, dense, 0)
-    empty = kept.sum(1) == 0
-    assert empty.any() or threshold < 0.9
-    largest = torch.zeros_like(dense).scatter_(1, dense.argmax(1, keepdim=True), 1.0)
-    kept = torch.where(empty[:, None], largest, kept)
-    torch.testing.assert_close(matrix.sparse(threshold).to_dense(), kept / kept.sum(1, True))
+    is_empty = kept.sum(1, keepdim=True) == 0
+    assert is_empty.any() or threshold < 0.9
+    largest_rows = dense.argmax(1, keepdim=True)
+    largest = torch.zeros_like(dense).scatter_(1, largest_rows, 1.0)
+    kept = torch.where(is_empty, largest, kept)
+    expected = kept / kept.sum(1, keepdim=True)
+
+    sparse = matrix.sparse(threshold)
+
+    torch.testing.assert_close(sparse.to_dense(), expected)
 
 
 def test_nonzero_counts_and_gram_equal_dense(path):
@@ -111,37 +136,71 @@ def test_nonzero_counts_and_gram_equal_dense(path):
     torch.testing.assert_close(matrix.gram(), dense.mT @ dense)
 
 
+def summaries(matrix):
+    """Return the sparse matrix, the numbers of its entries and the Gram matrix."""
+    return matrix.sparse(0.05).to_dense(), matrix.nonzero_counts(0.05), matrix.gram()
+
+
 def test_summaries_under_autocast_are_unchanged():
     matrix, _ = random_matrix(dtype=torch.float32)
+
     with torch.autocast("cpu", torch.bfloat16):
-        half = matrix.sparse(0.05).to_dense(), matrix.nonzero_counts(0.05), matrix.gram()
-    single = matrix.sparse(0.05).to_dense(), matrix.nonzero_counts(0.05), matrix.gram()
-    assert all(map(torch.equal, half, single))
+        under_autocast = summaries(matrix)
+
+    single = summaries(matrix)
+    torch.testing.assert_close(under_autocast, single, atol=0, rtol=0)
 
 
-def test_queries_of_every_cloud_equal_matrices_of_single_clouds(path):
+@pytest.fixture
+def matrix_per_cloud():
+    """Two clouds with queries of their own, as one matrix and as two."""
     matrix, points = random_matrix()
     rng = torch.Generator().manual_seed(3)
-    queries = torch.randn(2, 11, 8, dtype=torch.float64, generator=rng, requires_grad=True)
-    both = SamplingMatrix(queries, matrix.keys, 0.3)
-    alone = [SamplingMatrix(queries[b], matrix.keys[b : b + 1], 0.3) for b in range(2)]
-    want = torch.cat([one.sample(points[b : b + 1]) for b, one in enumerate(alone)])
-    torch.testing.assert_close(both.sample(points), want)
-    weight = torch.randn(2, 11, 3, dtype=torch.float64, generator=rng)
-    got = torch.autograd.grad((both.sample(points) * weight).sum(), queries)
-    torch.testing.assert_close(got, torch.autograd.grad((want * weight).sum(), queries))
-    dense = torch.cat([one.dense() for one in alone]).detach()
-    torch.testing.assert_close(both.dense(), dense)
-    torch.testing.assert_close(both.sparse(0.0).to_dense(), dense)
-    torch.testing.assert_close(both.gram(), dense.mT @ dense)
-    torch.testing.assert_close(both.nonzero_counts(0.05), (dense >= 0.05).to(dense).sum(1))
-    torch.testing.assert_close(both.leftmost(4).dense(), dense[..., :4])
-    torch.testing.assert_close(both.first_cloud().dense(), dense[:1])
-    assert both.leftmost(4).m == 4
+    queries = drawn_normal(rng, 2, 11, 8).requires_grad_()
+    together = SamplingMatrix(queries, matrix.keys, 0.3)
+    first = SamplingMatrix(queries[0], matrix.keys[:1], 0.3)
+    second = SamplingMatrix(queries[1], matrix.keys[1:], 0.3)
+    return together, first, second, points
+
+
+def test_samples_with_queries_of_every_cloud_equal_those_of_single_clouds(path, matrix_per_cloud):
+    together, first, second, points = matrix_per_cloud
+    of_first = first.sample(points[:1])
+    of_second = second.sample(points[1:])
+    expected = torch.cat([of_first, of_second])
+
+    sampled = together.sample(points)
+
+    torch.testing.assert_close(sampled, expected)
+    weight = drawn_normal(torch.Generator().manual_seed(4), 2, 11, 3)
+    gradient = torch.autograd.grad((sampled * weight).sum(), together.queries)
+    expected_gradient = torch.autograd.grad((expected * weight).sum(), together.queries)
+    torch.testing.assert_close(gradient, expected_gradient)
+
+
+def test_views_with_queries_of_every_cloud_equal_those_of_single_clouds(path, matrix_per_cloud):
+    together, first, second, _ = matrix_per_cloud
+    dense = torch.cat([first.dense(), second.dense()]).detach()
+    is_large = dense >= 0.05
+    leftmost = together.leftmost(4)
+
+    torch.testing.assert_close(together.dense(), dense)
+    torch.testing.assert_close(together.sparse(0.0).to_dense(), dense)
+    torch.testing.assert_close(together.gram(), dense.mT @ dense)
+    torch.testing.assert_close(together.nonzero_counts(0.05), is_large.to(dense).sum(1))
+    torch.testing.assert_close(leftmost.dense(), dense[..., :4])
+    torch.testing.assert_close(together.first_cloud().dense(), dense[:1])
+    assert leftmost.m == 4
 
 
 def test_leftmost_is_first_columns_and_first_cloud_has_all():
     matrix, points = random_matrix()
-    torch.testing.assert_close(matrix.leftmost(4).dense(), matrix.dense()[:, :, :4])
-    torch.testing.assert_close(matrix.leftmost(4).sample(points), matrix.sample(points)[:, :4])
-    torch.testing.assert_close(matrix.first_cloud().dense(), matrix.dense()[:1])
+    dense = matrix.dense()
+    sampled = matrix.sample(points)
+
+    leftmost = matrix.leftmost(4)
+    first_cloud = matrix.first_cloud()
+
+    torch.testing.assert_close(leftmost.dense(), dense[:, :, :4])
+    torch.testing.assert_close(leftmost.sample(points), sampled[:, :4])
+    torch.testing.assert_close(first_cloud.dense(), dense[:1])

@@ -17,30 +17,43 @@ def small(kind=MOPSNet, m=6, moved=False, **settings):
     torch.manual_seed(0)
     layers = {"feature_channels": (8, 6), "rho_channels": (12, 10)}
     net = kind(m, anchors="fps", **(layers | settings))
-    for weights in net.queries.parameters() if moved else ():
-        torch.nn.init.normal_(weights, std=0.5)
+    if moved:
+        for weights in net.queries.parameters():
+            torch.nn.init.normal_(weights, std=0.5)
     return net
 
 
 def farthest(points, m):
     """Farthest points, the first being farthest from the mean, one cloud at a time."""
-    start = (points - points.mean(1, keepdim=True)).norm(dim=2).argmax(1)
+    from_centre = points - points.mean(1, keepdim=True)
+    start = from_centre.norm(dim=2).argmax(1)
     return farthest_point_sample(points, m, start=start)
+
+
+def plain_spacing(points):
+    """Return for each cloud the distance that is the unit of the widths of columns."""
+    count = min(SPACING_POINTS, points.shape[1])
+    chosen = gather_points(points, farthest(points, count))
+    to_last = chosen[:, :-1] - chosen[:, -1:]
+    nearest = to_last.norm(dim=2).amin(1)
+    return nearest * (count / SPACING_POINTS) ** 0.5
 
 
 def plain_dense(net, points, keys):
     """S entry by entry of its definition: content of a slot, and distances to its anchor."""
-    count = min(SPACING_POINTS, points.shape[1])
-    chosen = gather_points(points, farthest(points, count))
-    unit = (chosen[:, :-1] - chosen[:, -1:]).norm(dim=2).amin(1) * (count / SPACING_POINTS) ** 0.5
+    unit = plain_spacing(points)
+    cloud = torch.arange(len(keys))
     columns = []
     for j, row in enumerate(farthest(points, net.m).T):
-        own = keys[torch.arange(len(keys)), row]
-        query = net.queries.slots[j] + own @ net.queries.relation.T / keys.shape[2] ** 0.5
-        anchor = points[torch.arange(len(keys)), row]
+        key_of_anchor = keys[cloud, row]
+        relation = key_of_anchor @ net.queries.relation.T
+        query = net.queries.slots[j] + relation / keys.shape[2] ** 0.5
+        content = (keys * query[:, None]).sum(2)
+        anchor = points[cloud, row]
         width = unit * net.queries.log_width[j].exp()
-        apart = (points - anchor[:, None]).square().sum(2) / width[:, None] ** 2
-        columns.append((((keys * query[:, None]).sum(2) - apart) / net.tau).softmax(1))
+        squares = (points - anchor[:, None]).square().sum(2)
+        logits = content - squares / width[:, None] ** 2
+        columns.append((logits / net.tau).softmax(1))
     return torch.stack(columns, 2)
 
 
@@ -49,27 +62,38 @@ def plain_dense(net, points, keys):
 def test_anchors_equal_dense_softmax_of_distances(training, number, rng):
     net = small(moved=True, tau_min=0.3).double().train(training)
     points = torch.randn(3, number, 3, dtype=torch.float64, generator=rng, requires_grad=True)
+    direction = torch.randn(3, 6, 3, dtype=torch.float64, generator=rng)
+
     output = net(points)
+
     assert output.matrix is not None
-    want = plain_dense(net, points, output.matrix.keys[..., :10])
-    torch.testing.assert_close(output.matrix.dense(), want)
-    torch.testing.assert_close(output.points, want.mT @ points)
-    weights = torch.randn(3, 6, 3, dtype=torch.float64, generator=rng)
+    keys = output.matrix.keys[..., :10]
+    dense = plain_dense(net, points, keys)
+    expected = dense.mT @ points
+    torch.testing.assert_close(output.matrix.dense(), dense)
+    torch.testing.assert_close(output.points, expected)
     parameters = list(net.queries.parameters())
-    got = torch.autograd.grad((output.points * weights).sum(), parameters, retain_graph=True)
-    expected = torch.autograd.grad(((want.mT @ points) * weights).sum(), parameters)
-    assert all(gradient.abs().max() > 0 for gradient in expected)
-    torch.testing.assert_close(got, expected)
+    along = (output.points * direction).sum()
+    gradients = torch.autograd.grad(along, parameters, retain_graph=True)
+    expected_gradients = torch.autograd.grad((expected * direction).sum(), parameters)
+    for gradient in expected_gradients:
+        assert gradient.abs().max() > 0
+    torch.testing.assert_close(gradients, expected_gradients)
 
 
 @pytest.mark.parametrize("m", [50, 200])
 @pytest.mark.parametrize("width", [0.3, 0.8])
 def test_untrained_anchors_are_near_farthest_points(width, m, rng):
-    points = torch.nn.functional.normalize(torch.randn(3, 1000, 3, generator=rng), dim=2)
+    directions = torch.randn(3, 1000, 3, generator=rng)
+    points = torch.nn.functional.normalize(directions, dim=2)
     net = small(m=m, tau_min=0.5, anchor_width=width).eval()
-    want = gather_points(points, farthest(points, m))
-    apart = (net(points).points - want).norm(dim=2)
-    between = torch.cdist(want, want)[:, -1, :-1].amin(1, keepdim=True)
+
+    sampled = net(points).points
+
+    anchors = gather_points(points, farthest(points, m))
+    apart = (sampled - anchors).norm(dim=2)
+    last_to_others = torch.cdist(anchors, anchors)[:, -1, :-1]
+    between = last_to_others.amin(1, keepdim=True)
     assert (apart < width * between).all()
     assert apart.max() > width * between.mean() / 20
 
@@ -77,27 +101,33 @@ def test_untrained_anchors_are_near_farthest_points(width, m, rng):
 def test_anchors_are_nested_in_size_and_weights(rng):
     points = torch.randn(2, 80, 3, generator=rng)
     net = small(FMOPSNet, m=16, moved=True).eval()
+
     whole = net(points)
     few = net(points, 5)
+    # More points than a smaller cloud has are not needed for fewer columns.
+    of_small_clouds = net(points[:, :7], 5)
+
+    first = whole.first(5)
     torch.testing.assert_close(few.points, whole.points[:, :5])
     torch.testing.assert_close(few.matrix.dense(), whole.matrix.dense()[..., :5])
-    torch.testing.assert_close(whole.first(5).matrix.gram(), few.matrix.gram())
-    # More points than a smaller cloud has are not needed for fewer columns.
-    assert net(points[:, :7], 5).points.shape == (2, 5, 3)
+    torch.testing.assert_close(first.matrix.gram(), few.matrix.gram())
+    assert of_small_clouds.points.shape == (2, 5, 3)
 
 
 def test_anchors_of_large_clouds_are_computed_in_blocks(rng, monkeypatch):
     points = torch.randn(2, 60, 3, generator=rng).double()  # gradients of widths cancel in float32
+    direction = torch.randn(2, 6, 3, generator=rng).double()
     net = small(moved=True).double()
-    whole = net(points)
-    weights = torch.randn(2, 6, 3, generator=rng).double()
     parameters = list(net.queries.parameters())
-    want = torch.autograd.grad((whole.points * weights).sum(), parameters)
+    whole = net(points).points
+    expected = torch.autograd.grad((whole * direction).sum(), parameters)
     monkeypatch.setitem(attention.BLOCKS, "cpu", attention.Blocks(0, 4, 10))
-    blocks = net(points)
-    torch.testing.assert_close(blocks.points, whole.points, atol=1e-12, rtol=0)
-    got = torch.autograd.grad((blocks.points * weights).sum(), parameters)
-    torch.testing.assert_close(got, want, atol=1e-9, rtol=1e-9)
+
+    by_blocks = net(points).points
+
+    torch.testing.assert_close(by_blocks, whole, atol=1e-12, rtol=0)
+    gradients = torch.autograd.grad((by_blocks * direction).sum(), parameters)
+    torch.testing.assert_close(gradients, expected, atol=1e-9, rtol=1e-9)
 
 
 def test_anchors_with_fused_layers_equal_layers(rng):
@@ -114,12 +144,14 @@ def test_anchors_with_fused_layers_equal_layers(rng):
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_anchors_in_half_precision_keep_distances(dtype, rng):
     points = torch.randn(2, 100, 3, generator=rng).to(dtype)
-    net = small(m=32)
+    net = small(m=32).eval()
     net.queries.log_width.data.fill_(-2.0)
-    want = net.eval()(points.float()).points
-    found = net.to(dtype)(points).points
-    assert found.dtype == dtype
-    torch.testing.assert_close(found.float(), want, atol=0.05, rtol=0)
+    in_single = net(points.float()).points
+
+    in_half = net.to(dtype)(points).points
+
+    assert in_half.dtype == dtype
+    torch.testing.assert_close(in_half.float(), in_single, atol=0.05, rtol=0)
 
 
 def test_anchors_warm_start_keeps_their_start():
@@ -140,16 +172,22 @@ def test_anchors_refuse_chunks(rng):
         stream_sample(net, lambda: torch.randn(50, 3, generator=rng).split(20))
 
 
+def median_width(net, points):
+    """Return the median over columns of the standard deviation around their means."""
+    columns = net(points).matrix.dense().detach()
+    means = columns.mT @ points
+    squares = (points[:, :, None] - means[:, None]).square().sum(3)
+    variances = (columns * squares).sum(1)
+    return variances.sqrt().median()
+
+
 def test_untrained_columns_are_as_wide_as_the_spacing_of_their_points(rng):
     plane = torch.rand(1, 4000, 3, generator=rng) * torch.tensor([1.0, 1.0, 0.0])
-    widths = {}
+    of_16 = small(m=16, anchor_width=0.5, tau_min=1.0).eval()
+    of_64 = small(m=64, anchor_width=0.5, tau_min=1.0).eval()
 
-    for m in (16, 64):
-        net = small(m=m, anchor_width=0.5, tau_min=1.0).eval()
-        columns = net(plane).matrix.dense().detach()
-        means = columns.mT @ plane
-        apart = (plane[:, :, None] - means[:, None]).square().sum(3)
-        widths[m] = (columns * apart).sum(1).sqrt().median()
+    wide = median_width(of_16, plane)
+    narrow = median_width(of_64, plane)
 
     # A quarter of the points on the same plane are twice as far apart.
-    assert widths[16] / widths[64] == pytest.approx(2.0, rel=0.2)
+    assert wide / narrow == pytest.approx(2.0, rel=0.2)

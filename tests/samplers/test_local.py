@@ -24,83 +24,121 @@ def local(kind=MOPSNet, m=6, candidates=4, neighbours=5, **settings):
     return net
 
 
+def drawn_normal(rng, *shape, dtype=DOUBLE, **options):
+    return torch.randn(shape, dtype=dtype, generator=rng, **options)
+
+
 def farthest(points, m):
-    start = (points - points.mean(1, keepdim=True)).norm(dim=2).argmax(1)
+    from_centre = points - points.mean(1, keepdim=True)
+    start = from_centre.norm(dim=2).argmax(1)
     return farthest_point_sample(points, m, start=start)
+
+
+def plain_keys(net, points):
+    """Return the keys ``(N, C)`` of a cloud ``(N, 3)``."""
+    local, global_ = net.features(points[None])
+    hidden = net.rho_local(local) + net.rho_global(global_)[:, None]
+    return net.rho(net.rho_first(hidden[0]))
+
+
+def plain_spacing(cloud, order):
+    """Return the distance that the sampler takes for the unit of its widths."""
+    count = min(SPACING_POINTS, len(cloud))
+    chosen = cloud[order[:count]]
+    to_last = (chosen[:-1] - chosen[-1]).norm(dim=1)
+    return to_last.amin() * (count / SPACING_POINTS) ** 0.5
+
+
+def plain_column(net, cloud, candidates, keys, j, anchor, unit):
+    """Return column j of S ``(N,)``."""
+    relation = net.queries.relation @ keys[j]
+    query = net.queries.slots[j] + relation / keys.shape[1] ** 0.5
+    squares = (cloud[candidates] - anchor).square().sum(1)
+    width = unit * net.queries.log_width[j].exp()
+    logits = keys @ query - squares / width**2
+    if net.queries.neighbours is not None:
+        near = squares.argsort(stable=True)[: net.queries.neighbours]
+        outside = torch.ones(len(candidates), dtype=torch.bool)
+        outside[near] = False
+        logits = logits.masked_fill(outside, -torch.inf)
+    weights = (logits / net.tau).softmax(0)
+    column = torch.zeros(len(cloud), dtype=cloud.dtype)
+    return column.index_put((candidates,), weights)
 
 
 def plain_dense(net, points, m):
     """S ``(B, N, m)``, entry by entry of its definition."""
-    matrices = []
     n = points.shape[1]
-    count = min(SPACING_POINTS, n)
-    wanted = n if net.queries.candidates is None else min(net.queries.candidates * net.m, n)
+    wanted = n
+    if net.queries.candidates is not None:
+        wanted = min(net.queries.candidates * net.m, n)
+    matrices = []
     for cloud in points:
         order = farthest(cloud[None], n)[0]
-        chosen = cloud[order[:count]]
-        unit = (chosen[:-1] - chosen[-1]).norm(dim=1).amin() * (count / SPACING_POINTS) ** 0.5
+        unit = plain_spacing(cloud, order)
         candidates = order[:wanted]
-        local, global_ = net.features(cloud[None, candidates])
-        hidden = net.rho_local(local) + net.rho_global(global_)[:, None]
-        keys = net.rho(net.rho_first(hidden[0]))
+        keys = plain_keys(net, cloud[candidates])
         columns = []
         for j in range(m):
             anchor = cloud[order[j]]
-            query = net.queries.slots[j] + net.queries.relation @ keys[j] / keys.shape[1] ** 0.5
-            squares = (cloud[candidates] - anchor).square().sum(1)
-            width = unit * net.queries.log_width[j].exp()
-            logits = keys @ query - squares / width**2
-            if net.queries.neighbours is not None:
-                near = squares.argsort(stable=True)[: net.queries.neighbours]
-                outside = torch.ones(wanted, dtype=torch.bool)
-                outside[near] = False
-                logits = logits.masked_fill(outside, -torch.inf)
-            column = torch.zeros(n, dtype=cloud.dtype)
-            columns.append(column.index_put((candidates,), (logits / net.tau).softmax(0)))
+            columns.append(plain_column(net, cloud, candidates, keys, j, anchor, unit))
         matrices.append(torch.stack(columns, 1))
     return torch.stack(matrices)
 
 
 @pytest.mark.parametrize(
-    ("candidates", "neighbours"), [(4, 5), (2, 12), (3, None), (None, 7), (40, 9), (1, 1)]
+    ("candidates", "neighbours"),
+    [
+        (4, 5),
+        (2, 12),
+        (3, None),
+        (None, 7),
+        (40, 9),
+        (1, 1),
+    ],
 )
 def test_local_columns_equal_a_dense_softmax_with_infinite_logits_outside(
     candidates, neighbours, rng
 ):
     net = local(candidates=candidates, neighbours=neighbours, tau_min=0.3)
-    net(torch.randn(4, 90, 3, dtype=DOUBLE, generator=rng))  # running statistics
+    net(drawn_normal(rng, 4, 90, 3))  # running statistics
     net.eval()
-    points = torch.randn(3, 90, 3, dtype=DOUBLE, generator=rng, requires_grad=True)
-    direction = torch.randn(3, 6, 3, dtype=DOUBLE, generator=rng)
+    points = drawn_normal(rng, 3, 90, 3, requires_grad=True)
+    direction = drawn_normal(rng, 3, 6, 3)
 
     output = net(points)
-    want = plain_dense(net, points, 6)
 
-    torch.testing.assert_close(output.matrix.dense(), want)
-    torch.testing.assert_close(output.points, want.mT @ points)
+    dense = plain_dense(net, points, 6)
+    expected = dense.mT @ points
+    torch.testing.assert_close(output.matrix.dense(), dense)
+    torch.testing.assert_close(output.points, expected)
     inputs = [points, *net.parameters()]
-    got = torch.autograd.grad((output.points * direction).sum(), inputs, retain_graph=True)
-    expected = torch.autograd.grad(((want.mT @ points) * direction).sum(), inputs)
-    torch.testing.assert_close(got, expected)
+    along = (output.points * direction).sum()
+    gradients = torch.autograd.grad(along, inputs, retain_graph=True)
+    expected_gradients = torch.autograd.grad((expected * direction).sum(), inputs)
+    torch.testing.assert_close(gradients, expected_gradients)
     if neighbours != 1:
-        assert all(gradient.abs().max() > 0 for gradient in expected)
+        for gradient in expected_gradients:
+            assert gradient.abs().max() > 0
 
 
 def test_local_views_of_s_equal_those_of_the_dense_matrix(rng):
     net = local(m=10, candidates=3, neighbours=8).eval()
-    points = torch.randn(2, 70, 3, dtype=DOUBLE, generator=rng)
+    points = drawn_normal(rng, 2, 70, 3)
+    values = drawn_normal(rng, 2, 70, 5)
 
     matrix = net.sampling_matrix(points)
 
     dense = matrix.dense()
+    is_large = dense >= 0.01
+    kept = dense.where(is_large, 0.0)
+    renormalised = kept / kept.sum(1, keepdim=True)
     assert dense.shape == (2, 70, 10)
     torch.testing.assert_close(dense.sum(1), torch.ones(2, 10, dtype=DOUBLE))
     torch.testing.assert_close(matrix.gram(), dense.mT @ dense)
-    assert torch.equal(matrix.nonzero_counts(), (dense >= 0.01).sum(1).double())
-    kept = dense.where(dense >= 0.01, 0.0)
-    torch.testing.assert_close(matrix.sparse().to_dense(), kept / kept.sum(1, keepdim=True))
+    assert torch.equal(matrix.nonzero_counts(), is_large.sum(1).double())
+    torch.testing.assert_close(matrix.sparse().to_dense(), renormalised)
     assert torch.equal(matrix.first_cloud().dense(), dense[:1])
-    values = torch.randn(2, 70, 5, dtype=DOUBLE, generator=rng)
     torch.testing.assert_close(matrix.sample(values), dense.mT @ values)
 
 
@@ -109,34 +147,38 @@ def test_local_sparse_keeps_the_largest_entry_of_a_column_without_large_ones(rng
     for weights in net.queries.parameters():
         torch.nn.init.constant_(weights, 0)
     net.queries.log_width.data.fill_(9)  # uniform columns
+    matrix = net.sampling_matrix(drawn_normal(rng, 1, 80, 3))
 
-    sparse = net.sampling_matrix(torch.randn(1, 80, 3, dtype=DOUBLE, generator=rng)).sparse(0.5)
+    sparse = matrix.sparse(0.5)
 
-    assert sparse.values().tolist() == [1.0] * 6
+    assert sparse.values().tolist() == [1.0, 1.0, 1.0, 1.0, 1.0, 1.0]
 
 
 def test_local_overlap_equals_that_of_the_dense_matrix(rng):
     net = local(m=10, candidates=3, neighbours=8, overlap=2.0, alpha=0.0)
-    points = torch.randn(2, 70, 3, dtype=DOUBLE, generator=rng)
+    points = drawn_normal(rng, 2, 70, 3)
+
     output = net(points)
+
     dense = output.matrix.dense()
     gram = (dense.mT @ dense).square()
-    off_diagonal = gram - gram.diagonal(dim1=1, dim2=2).diag_embed()
-
-    want = 2.0 * off_diagonal.sum((1, 2)).mean() / 10
-
-    torch.testing.assert_close(output.losses["overlap"], want)
+    diagonal = gram.diagonal(dim1=1, dim2=2).diag_embed()
+    off_diagonal = gram - diagonal
+    expected = 2.0 * off_diagonal.sum((1, 2)).mean() / 10
+    overlap = output.losses["overlap"]
+    torch.testing.assert_close(overlap, expected)
     slots = net.queries.slots
-    got = torch.autograd.grad(output.losses["overlap"], slots, retain_graph=True)
-    torch.testing.assert_close(got, torch.autograd.grad(want, slots))
+    gradient = torch.autograd.grad(overlap, slots, retain_graph=True)
+    expected_gradient = torch.autograd.grad(expected, slots)
+    torch.testing.assert_close(gradient, expected_gradient)
 
 
 def test_local_smaller_samples_are_prefixes_with_one_loss_for_each(rng):
     # Of two points there would be six candidates, if they were counted for each size.
     net = local(FMOPSNet, m=16, candidates=3, neighbours=6, overlap=1.0)
     torch.nn.init.constant_(net.queries.log_width, 2.0)  # all neighbours count
-    points = torch.randn(2, 80, 3, dtype=DOUBLE, generator=rng)
-    losses = net.sample_sizes(points, (2, 16))
+    points = drawn_normal(rng, 2, 80, 3)
+    of_sizes = net.sample_sizes(points, (2, 16))
     net.eval()
 
     whole = net(points)
@@ -144,8 +186,9 @@ def test_local_smaller_samples_are_prefixes_with_one_loss_for_each(rng):
 
     torch.testing.assert_close(few.points, whole.points[:, :2])
     torch.testing.assert_close(few.matrix.dense(), whole.matrix.dense()[..., :2])
-    torch.testing.assert_close(whole.first(2).matrix.gram(), few.matrix.gram())
-    assert set(losses[2].losses) == {"subset", "overlap"}
+    first_two = whole.first(2).matrix
+    torch.testing.assert_close(first_two.gram(), few.matrix.gram())
+    assert set(of_sizes[2].losses) == {"subset", "overlap"}
 
 
 def test_local_columns_do_not_depend_on_the_order_of_the_points(rng):
@@ -159,66 +202,74 @@ def test_local_columns_do_not_depend_on_the_order_of_the_points(rng):
 
 
 def test_local_neighbours_by_a_tree_equal_all_distances(rng, monkeypatch):
-    points = torch.randn(2, 500, 3, generator=rng)
-    want = local_attention.nearest_rows(points[:, :40], points, 12)
-
+    points = drawn_normal(rng, 2, 500, 3, dtype=torch.float32)
+    queries = points[:, :40]
+    by_distances = local_attention.nearest_rows(queries, points, 12)
     monkeypatch.setattr(local_attention, "TREE_MIN_WORK", 0)
 
-    assert torch.equal(local_attention.nearest_rows(points[:, :40], points, 12), want)
-    assert local_attention.nearest_rows(points[:, :40], points, 1).shape == (2, 40, 1)
+    by_tree = local_attention.nearest_rows(queries, points, 12)
+    nearest_by_tree = local_attention.nearest_rows(queries, points, 1)
+
+    assert torch.equal(by_tree, by_distances)
+    assert nearest_by_tree.shape == (2, 40, 1)
 
 
 def test_local_products_in_loops_equal_gathered_keys(rng):
-    queries = torch.randn(2, 5, 37, dtype=DOUBLE, generator=rng, requires_grad=True)
-    keys = torch.randn(2, 9, 37, dtype=DOUBLE, generator=rng, requires_grad=True)
-    places = torch.randint(9, (2, 5, 4), generator=rng)
-    gathered = gather_points(keys, places)
+    queries = drawn_normal(rng, 2, 5, 37, requires_grad=True)
+    keys = drawn_normal(rng, 2, 9, 37, requires_grad=True)
+    rows = torch.randint(9, (2, 5, 4), generator=rng)
 
-    products = local_attention.chosen_products(queries, keys, places)
+    def products_of(queries, keys):
+        return local_attention.chosen_products(queries, keys, rows)
 
-    torch.testing.assert_close(products, (gathered * queries[:, :, None]).sum(3))
-    assert torch.autograd.gradcheck(
-        lambda left, right: local_attention.chosen_products(left, right, places), (queries, keys)
-    )
+    products = products_of(queries, keys)
+
+    gathered = gather_points(keys, rows)
+    expected = (gathered * queries[:, :, None]).sum(3)
+    torch.testing.assert_close(products, expected)
+    assert torch.autograd.gradcheck(products_of, (queries, keys))
 
 
 def test_weighted_sums_equal_those_of_gathered_rows_and_so_do_their_gradients(rng):
-    weights = torch.rand(2, 5, 4, dtype=torch.float64, generator=rng, requires_grad=True)
-    values = torch.randn(2, 9, 3, dtype=torch.float64, generator=rng, requires_grad=True)
+    weights = torch.rand(2, 5, 4, dtype=DOUBLE, generator=rng, requires_grad=True)
+    values = drawn_normal(rng, 2, 9, 3, requires_grad=True)
     rows = torch.randint(9, (2, 5, 4), generator=rng)  # some repeat
 
-    sums = local_attention.weighted_sums(weights, rows, values)
+    def sums_of(weights, values):
+        return local_attention.weighted_sums(weights, rows, values)
+
+    sums = sums_of(weights, values)
 
     gathered = gather_points(values, rows)
-    torch.testing.assert_close(sums, (weights[..., None] * gathered).sum(2))
-    assert torch.autograd.gradcheck(
-        lambda left, right: local_attention.weighted_sums(left, rows, right), (weights, values)
-    )
+    expected = (weights[..., None] * gathered).sum(2)
+    torch.testing.assert_close(sums, expected)
+    assert torch.autograd.gradcheck(sums_of, (weights, values))
 
 
 def test_local_matched_points_are_chosen_from_all_points(rng):
     net = local(m=4, candidates=1, neighbours=1).float().eval()
-    points = torch.randn(50, 3, generator=rng)
+    points = drawn_normal(rng, 50, 3, dtype=torch.float32)
     generated, _ = net.downsample(points, readout="generated")
 
     matched, rows = net.downsample(points, readout="matched")
 
-    assert torch.equal(rows, torch.cdist(generated, points).argmin(1))
-    assert torch.equal(matched, points[rows])
+    nearest = torch.cdist(generated, points).argmin(1)
+    assert torch.equal(rows, nearest)
+    assert torch.equal(matched, points[nearest])
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_local_columns_in_half_precision_are_near_those_in_single(dtype, rng):
-    net = local(m=16, candidates=3, neighbours=6).float()
+    net = local(m=16, candidates=3, neighbours=6).float().eval()
     for weights in net.queries.parameters():
         torch.nn.init.constant_(weights, 0)
-    points = torch.randn(2, 100, 3, generator=rng).to(dtype)
-    want = net.eval()(points.float()).points
+    points = drawn_normal(rng, 2, 100, 3, dtype=torch.float32).to(dtype)
+    in_single = net(points.float()).points
 
-    found = net.to(dtype)(points).points
+    in_half = net.to(dtype)(points).points
 
-    assert found.dtype == dtype
-    torch.testing.assert_close(found.float(), want, atol=0.05, rtol=0)
+    assert in_half.dtype == dtype
+    torch.testing.assert_close(in_half.float(), in_single, atol=0.05, rtol=0)
 
 
 @pytest.mark.parametrize(

@@ -50,39 +50,50 @@ def test_shift_and_scale_change_nothing(net, clouds):
     assert points.dtype == torch.float64
 
 
+@pytest.fixture
+def batch():
+    """The cloud of each point of the three clouds, when they are joined."""
+    return torch.arange(3).repeat_interleave(torch.tensor([20, 40, 20]))
+
+
 @pytest.mark.parametrize("readout", ["generated", "completed"])
-def test_batch_gives_the_same_as_single_clouds(net, clouds, readout):
-    single = [net.downsample(cloud, readout=readout) for cloud in clouds]
-    batch = torch.arange(3).repeat_interleave(torch.tensor([20, 40, 20]))
-    flat, flat_indices = net.downsample(torch.cat(clouds), None, readout, batch=batch)
-    for i, (expected, _) in enumerate(single):
-        assert torch.allclose(flat[8 * i : 8 * i + 8], expected)
+def test_batch_gives_the_same_as_single_clouds(net, clouds, batch, readout):
+    joined = torch.cat(clouds)
+    single = []
+    for cloud in clouds:
+        points, _ = net.downsample(cloud, readout=readout)
+        single.append(points)
+
+    flat, rows = net.downsample(joined, None, readout, batch=batch)
+
+    assert torch.allclose(flat, torch.cat(single))
     if readout == "generated":
-        assert flat_indices is None
+        assert rows is None
     else:
-        assert torch.equal(torch.cat(clouds)[flat_indices], flat)
+        assert torch.equal(joined[rows], flat)
 
 
-def test_small_clouds_are_returned_whole(net, clouds):
+def test_small_clouds_are_returned_whole(clouds, batch):
     sampler = FPSSampler(30)
-    batch = torch.arange(3).repeat_interleave(torch.tensor([20, 40, 20]))
+
     points, rows = sampler.downsample(torch.cat(clouds), batch=batch)
-    assert batch[rows].bincount().tolist() == [20, 30, 20]
+
+    numbers = batch[rows].bincount()
+    assert numbers.tolist() == [20, 30, 20]
     assert torch.equal(points[:20], clouds[0])
     assert rows[:20].tolist() == list(range(20))
     assert len(rows.unique()) == 70
 
 
 def test_arrays_in_arrays_out(net, clouds):
-    points, indices = net.downsample(clouds[0].numpy())
-    expected = net.downsample(clouds[0])
+    cloud = clouds[0]
+    expected_points, expected_rows = net.downsample(cloud)
+
+    points, rows = net.downsample(cloud.numpy())
+
     assert isinstance(points, np.ndarray)
-    assert np.array_equal(points, expected[0].numpy())
-    assert np.array_equal(indices, expected[1].numpy())
-    points, indices = net.downsample(clouds[0].double().numpy(), readout="generated")
-    assert (points.dtype, indices) == (np.float64, None)
-    batch = np.repeat(np.arange(2), 10)
-    assert net.downsample(clouds[0].numpy(), np.int64(8), batch=batch)[0].shape == (16, 3)
+    assert np.array_equal(points, expected_points.numpy())
+    assert np.array_equal(rows, expected_rows.numpy())
 
 
 def test_arrays_of_any_byte_order_and_read_only_arrays(net, clouds):
@@ -94,11 +105,31 @@ def test_arrays_of_any_byte_order_and_read_only_arrays(net, clouds):
         assert np.array_equal(net.downsample(same)[1], expected)
 
 
+def test_arrays_of_double_precision_in_and_out(net, clouds):
+    cloud = clouds[0].double().numpy()
+
+    points, rows = net.downsample(cloud, readout="generated")
+
+    assert points.dtype == np.float64
+    assert rows is None
+
+
+def test_whole_numbers_of_numpy_are_sizes(net, clouds):
+    batch = np.repeat([0, 1], 10)
+
+    points, _ = net.downsample(clouds[0].numpy(), np.int64(8), batch=batch)
+
+    assert points.shape == (16, 3)
+
+
 @pytest.mark.parametrize("dtype", ["uint16", "uint32", "uint64", "int32"])
 def test_batch_of_any_whole_numbers(net, clouds, dtype):
-    batch = np.repeat(np.arange(2), 10)
-    found = net.downsample(clouds[0], batch=batch.astype(dtype))
-    assert torch.equal(found[1], net.downsample(clouds[0], batch=batch)[1])
+    batch = np.repeat([0, 1], 10)
+    _, expected = net.downsample(clouds[0], batch=batch)
+
+    _, rows = net.downsample(clouds[0], batch=batch.astype(dtype))
+
+    assert torch.equal(rows, expected)
 
 
 def test_double_precision_sampler_takes_any_points(net, clouds):
@@ -138,32 +169,49 @@ def test_mistakes_are_one_line(net, mistake):
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize("sampler", [FPSSampler(8), PoissonSampler(8), RandomSampler(8), "net"])
+TRAINED = "net"
+"""Stands for the fixture among samplers."""
+
+
+@pytest.mark.parametrize("sampler", [FPSSampler(8), PoissonSampler(8), RandomSampler(8), TRAINED])
 def test_weights_of_single_batched_and_ragged_clouds_agree(sampler, net, rng):
-    sampler = net if sampler == "net" else sampler
+    if sampler == TRAINED:
+        sampler = net
     points = 9 * torch.rand(3, 40, 3, generator=rng)
     weight = torch.rand(3, 40, generator=rng)
     weight[1, ::2] = 0  # left out
+    batch = torch.arange(3).repeat_interleave(40)
+    joined = points.flatten(0, 1).numpy()
+    joined_weight = weight.flatten().numpy()
+
     chosen, rows = sampler.downsample(points, weight=weight)
+    _, joined_rows = sampler.downsample(joined, batch=batch, weight=joined_weight)
+
     assert torch.equal(chosen, gather_points(points, rows))
-    assert (weight.gather(1, rows) > 0).all()
-    assert all(len(set(part)) == 8 for part in rows.tolist())
-    clouds = zip(points, weight, strict=True)
-    single = [sampler.downsample(cloud, weight=part)[1] for cloud, part in clouds]
-    assert torch.equal(torch.stack(single), rows)
-    batch, flat_points = torch.arange(3).repeat_interleave(40), points.flatten(0, 1).numpy()
-    flat = sampler.downsample(flat_points, batch=batch, weight=weight.flatten().numpy())
-    assert flat[1].tolist() == (rows + 40 * torch.arange(3)[:, None]).flatten().tolist()
+    weight_of_chosen = weight.gather(1, rows)
+    assert (weight_of_chosen > 0).all()
+    first_rows = 40 * torch.arange(3)
+    expected_rows = rows + first_rows[:, None]
+    assert joined_rows.tolist() == expected_rows.flatten().tolist()
+    for i in range(3):
+        _, rows_alone = sampler.downsample(points[i], weight=weight[i])
+        assert torch.equal(rows_alone, rows[i])
+        assert len(rows_alone.unique()) == 8
 
 
 def test_weights_by_curvature_are_those_of_each_cloud(rng):
     points = torch.rand(90, 3, generator=rng)
     weight = curvature(points.numpy())
-    expected = FPSSampler(8).downsample(points, weight=weight)[1]
-    assert torch.equal(FPSSampler(8).downsample(points, weight="curvature")[1], expected)
-    twice, batch = points.repeat(2, 1), torch.arange(180) // 90
-    both = FPSSampler(8).downsample(twice, batch=batch, weight="curvature")
-    assert torch.equal(both[1][:8], expected)
+    twice = torch.cat([points, points])
+    batch = torch.arange(180) // 90
+    sampler = FPSSampler(8)
+    _, expected = sampler.downsample(points, weight=weight)
+
+    _, rows = sampler.downsample(points, weight="curvature")
+    _, rows_of_both = sampler.downsample(twice, batch=batch, weight="curvature")
+
+    assert torch.equal(rows, expected)
+    assert torch.equal(rows_of_both[:8], expected)
 
 
 @pytest.mark.parametrize(
@@ -189,9 +237,12 @@ def test_points_that_are_not_finite_are_rejected(weight):
 
 
 def test_weights_for_other_methods_and_samplers_in_training_mode_are_rejected(net):
+    points = torch.rand(40, 3)
+    weight = torch.ones(40)
+
     with pytest.raises(UserError, match="VoxelSampler takes no weights"):
-        VoxelSampler(8).downsample(torch.rand(40, 3), weight=torch.ones(40))
+        VoxelSampler(8).downsample(points, weight=weight)
     with pytest.raises(UserError, match="generated readout takes no weights"):
-        net.downsample(torch.rand(40, 3), readout="generated", weight=torch.ones(40))
+        net.downsample(points, readout="generated", weight=weight)
     with pytest.raises(UserError, match=r"call eval\(\)"):
-        SNet(8).downsample(torch.rand(20, 3))
+        SNet(8).downsample(points)

@@ -18,59 +18,105 @@ samble = import_module("benchmarks.rivals.samble")
 selector = import_module("benchmarks.rivals.selector")
 
 
-@pytest.mark.parametrize(
-    "choice", ["lightn", "csnet", "apes", "apes sampler.variant=global", "samble"]
-)
-def test_rival_trains_every_weight_and_ignores_order_of_points(choice, rng):
+def composed(choice):
+    """Return a rival as ``sampler=NAME`` builds it."""
     rivals = Path(__file__).parents[2] / "benchmarks" / "rivals" / "conf"
-    settings = [f"hydra.searchpath=[file://{rivals}]", "m=6", *f"sampler={choice}".split()]
+    overrides = [f"hydra.searchpath=[file://{rivals}]", "m=6", *choice]
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        sampler = build(compose("config", settings).sampler, "sampler")
-    points, order = torch.randn(3, 50, 3, generator=rng), torch.randperm(50, generator=rng)
+        cfg = compose("config", overrides)
+    return build(cfg.sampler, "sampler")
+
+
+CHOICES = {
+    "lightn": ["sampler=lightn"],
+    "csnet": ["sampler=csnet"],
+    "apes": ["sampler=apes"],
+    "apes-global": ["sampler=apes", "sampler.variant=global"],
+    "samble": ["sampler=samble"],
+}
+
+
+@pytest.mark.parametrize("choice", CHOICES.values(), ids=CHOICES)
+def test_rival_trains_every_weight(choice, rng):
+    sampler = composed(choice)
+    points = torch.randn(3, 50, 3, generator=rng)
+
     output = sampler(points)
-    seen = output.points if output.soft_projected is None else output.soft_projected
-    (seen.square().sum() + sum(output.losses.values())).backward()
-    assert all(p.grad is not None and p.grad.any() for p in sampler.parameters())
-    chosen, turned = sampler.eval()(points), sampler(points[:, order])
-    assert chosen.points.shape == (3, 6, 3)
-    torch.testing.assert_close(turned.points, chosen.points, atol=1e-4, rtol=1e-4)
-    assert sampler.generates or torch.equal(order[turned.indices], chosen.indices)
+    seen = output.points
+    if output.soft_projected is not None:
+        seen = output.soft_projected
+    loss = seen.square().sum() + sum(output.losses.values())
+    loss.backward()
+
+    for name, weights in sampler.named_parameters():
+        assert weights.grad is not None, name
+        assert weights.grad.any(), name
+
+
+@pytest.mark.parametrize("choice", CHOICES.values(), ids=CHOICES)
+def test_rival_ignores_order_of_points(choice, rng):
+    sampler = composed(choice)
+    points = torch.randn(3, 50, 3, generator=rng)
+    order = torch.randperm(50, generator=rng)
+    sampler(points)  # running statistics
+    sampler.eval()
+
+    sampled = sampler(points)
+    sampled_in_order = sampler(points[:, order])
+
+    assert sampled.points.shape == (3, 6, 3)
+    torch.testing.assert_close(sampled_in_order.points, sampled.points, atol=1e-4, rtol=1e-4)
+    if not sampler.generates:
+        assert torch.equal(order[sampled_in_order.indices], sampled.indices)
 
 
 def test_self_correlation_equals_plain_sums(rng):
     cloud = torch.randn(7, 4, generator=rng)
-    for row, got in zip(cloud, lightn.self_correlation(cloud[None])[0], strict=True):
-        shares = (cloud * row).sum(1).div(2).exp()
-        torch.testing.assert_close(got, (shares[:, None] * cloud).sum(0) / shares.sum())
+
+    (correlation,) = lightn.self_correlation(cloud[None])
+
+    for row, found in zip(cloud, correlation, strict=True):
+        products = (cloud * row).sum(1)
+        shares = (products / 2).exp()
+        weighted = shares[:, None] * cloud
+        torch.testing.assert_close(found, weighted.sum(0) / shares.sum())
 
 
 def test_soft_top_k_is_sigmoid_above_threshold_that_gives_k(rng):
-    scores, low, high = torch.randn(40, generator=rng), -50.0, 50.0
+    scores = torch.randn(40, generator=rng)
+    low = -50.0
+    high = 50.0
     for _ in range(60):
         middle = (low + high) / 2
         degrees = (2 * scores / 0.5 - middle).sigmoid()
-        low, high = (middle, high) if degrees.sum() > 9 else (low, middle)
-    got = selector.soft_top_k(scores[None], 9, 0.5, iterations=200)[0]
-    torch.testing.assert_close(got, degrees, atol=1e-4, rtol=0)
+        if degrees.sum() > 9:
+            low = middle
+        else:
+            high = middle
+
+    (found,) = selector.soft_top_k(scores[None], 9, 0.5, iterations=200)
+
+    torch.testing.assert_close(found, degrees, atol=1e-4, rtol=0)
 
 
-@pytest.mark.parametrize("variant", ["local", "global"])
-def test_apes_scores_equal_plain_attention_in_feature_space(variant, rng):
+@pytest.mark.parametrize(("variant", "neighbours"), [("local", 4), ("global", 20)])
+def test_apes_scores_equal_plain_attention_in_feature_space(variant, neighbours, rng):
     features = torch.randn(20, 6, generator=rng)
     sampling = apes.EdgeSampling(6, variant, k=4)
 
     scores, _, _ = sampling(features[None])
 
-    want = torch.zeros(20)
+    expected = torch.zeros(20)
     for i, away in enumerate(torch.cdist(features, features)):
-        near = away.argsort()[: 4 if variant == "local" else 20]
+        near = away.argsort()[:neighbours]
         keys = sampling.keys(features[near] - features[i])
-        weights = (keys @ sampling.queries(features[i]) / 6**0.5).softmax(0)
+        query = sampling.queries(features[i])
+        weights = (keys @ query / 6**0.5).softmax(0)
         if variant == "local":
-            want[i] = weights.std(unbiased=False)
+            expected[i] = weights.std(unbiased=False)
         else:
-            want[near] += weights
-    torch.testing.assert_close(scores[0], want)
+            expected[near] += weights
+    torch.testing.assert_close(scores[0], expected)
 
 
 def test_edge_convolution_equals_plain_maximum_over_neighbours(rng):
@@ -78,52 +124,66 @@ def test_edge_convolution_equals_plain_maximum_over_neighbours(rng):
     features[7] = features[2]  # a copy
     layer = edge_net.EdgeConvolution(4, 5, 6, k=3).eval()
 
-    got = layer(features[None])[0]
+    (convolved,) = layer(features[None])
 
     for i, away in enumerate(torch.cdist(features, features)):
-        edges = [torch.cat([features[i], features[j] - features[i]]) for j in away.argsort()[:3]]
-        want = layer.layers(torch.stack(edges)).max(0).values
-        torch.testing.assert_close(got[i], want)
+        centre = features[i]
+        edges = []
+        for j in away.argsort()[:3]:
+            difference = features[j] - centre
+            edges.append(torch.cat([centre, difference]))
+        values = layer.layers(torch.stack(edges))
+        torch.testing.assert_close(convolved[i], values.max(0).values)
 
 
 def test_neighbour_attention_equals_plain_heads_over_differences(rng):
     features = torch.randn(9, 8, generator=rng)
     block = edge_net.NeighbourAttention(8, heads=2, expansion=4, k=3)
 
-    got = block.attend(features[None])[0]
+    (attended,) = block.attend(features[None])
 
     for i, away in enumerate(torch.cdist(features, features)):
-        differences = features[away.argsort()[:3]] - features[i]
+        near = away.argsort()[:3]
+        differences = features[near] - features[i]
         keys = block.keys(differences)
         values = block.values(differences)
         query = block.queries(features[i])
         heads = []
-        for part in (slice(0, 4), slice(4, 8)):
-            weights = (keys[:, part] @ query[part] / 2).softmax(0)
-            heads.append(weights @ values[:, part])
-        torch.testing.assert_close(got[i], torch.cat(heads), atol=1e-5, rtol=1e-5)
+        for channels in (slice(0, 4), slice(4, 8)):
+            logits = keys[:, channels] @ query[channels] / 2
+            heads.append(logits.softmax(0) @ values[:, channels])
+        expected = torch.cat(heads)
+        torch.testing.assert_close(attended[i], expected, atol=1e-5, rtol=1e-5)
 
 
 def test_apes_selects_from_all_points_in_two_stages(rng):
     points = torch.randn(2, 200, 3, generator=rng)
-    sampler = apes.APES(5, k=4, channels=16)
+    sampler = apes.APES(5, k=4, channels=16).eval()
 
-    output = sampler.eval()(points)
+    output = sampler(points)
 
+    first_rows, second_rows = output.indices
     assert output.indices.max() > 100
-    assert all(len(set(rows.tolist())) == 5 for rows in output.indices)
-    torch.testing.assert_close(output.points[1], points[1][output.indices[1]])
+    assert len(first_rows.unique()) == 5
+    assert len(second_rows.unique()) == 5
+    torch.testing.assert_close(output.points[1], points[1][second_rows])
 
 
 def test_samble_scores_equal_plain_columns_over_neighbours(rng):
     attention = torch.rand(1, 8, 8, generator=rng)
     rows = torch.rand(1, 8, 8, generator=rng).argsort(2)[..., :3]
 
-    got = samble.sparse_scores(attention, rows)[0]
+    (scores,) = samble.sparse_scores(attention, rows)
 
     for column in range(8):
-        paid = [float(attention[0, i, column]) for i in range(8) if column in rows[0, i]]
-        assert float(got[column]) == pytest.approx(sum(paid) / max(len(paid), 1) ** 2)
+        total = 0.0
+        count = 0
+        for i in range(8):
+            if column in rows[0, i]:
+                total += float(attention[0, i, column])
+                count += 1
+        expected = total / max(count, 1) ** 2
+        assert float(scores[column]) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(
@@ -150,15 +210,16 @@ def test_samble_takes_highest_priorities_of_every_bin(rng):
     bins[:, :6] = torch.tensor([0, 0, 1, 1, 2, 2])
     counts = torch.tensor([[2, 1, 2], [1, 2, 2]])
 
-    got = samble.chosen_rows(priorities, bins, counts)
+    rows = samble.chosen_rows(priorities, bins, counts)
 
     for cloud in range(2):
-        want = set()
+        expected = set()
         for number in range(3):
-            members = [row for row in range(12) if bins[cloud, row] == number]
-            highest = sorted(members, key=priorities[cloud].tolist().__getitem__, reverse=True)
-            want |= set(highest[: int(counts[cloud, number])])
-        assert set(got[cloud].tolist()) == want
+            (members,) = torch.where(bins[cloud] == number)
+            by_priority = priorities[cloud, members].argsort(descending=True)
+            highest = members[by_priority][: counts[cloud, number]]
+            expected.update(highest.tolist())
+        assert set(rows[cloud].tolist()) == expected
 
 
 def test_samble_boundaries_divide_first_batch_equally_then_move_slowly(rng):

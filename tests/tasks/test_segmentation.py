@@ -32,48 +32,117 @@ class Halves(nn.Module):
         return torch.stack([-points[..., 0], points[..., 0]], 2) * 50
 
 
+def plainly_interpolated(values, points, query):
+    """Return the mean of the values at the 3 nearest points, weighted by inverse squares."""
+    squared = (points - query).square().sum(1)
+    near = squared.argsort()[:3]
+    weights = 1 / squared[near]
+    weighted = values[near] * weights[:, None]
+    return weighted.sum(0) / weights.sum()
+
+
 def test_interpolation_equals_plain_loops(rng):
     values = torch.rand(2, 6, 4, generator=rng)
     points = torch.rand(2, 6, 3, generator=rng)
     queries = torch.rand(2, 9, 3, generator=rng)
+
     found = interpolate(values, points, queries)
+
     for cloud in range(2):
         for query, row in zip(queries[cloud], found[cloud], strict=True):
-            squared = (points[cloud] - query).square().sum(1)
-            near = squared.argsort()[:3]
-            weights = 1 / squared[near]
-            expected = (values[cloud, near] * weights[:, None]).sum(0) / weights.sum()
+            expected = plainly_interpolated(values[cloud], points[cloud], query)
             torch.testing.assert_close(row, expected, rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(interpolate(values, points, points), values, rtol=1e-4, atol=1e-4)
-    assert interpolate(values[:, :1], points[:, :1], queries).shape == (2, 9, 4)
-    given = [one[:1].double().requires_grad_() for one in (values, points, queries)]
-    assert torch.autograd.gradcheck(interpolate, given)
 
 
-def test_all_points_are_scored_from_few(rng):
+def test_interpolation_at_the_points_returns_their_values(rng):
+    values = torch.rand(2, 6, 4, generator=rng)
+    points = torch.rand(2, 6, 3, generator=rng)
+
+    found = interpolate(values, points, points)
+
+    torch.testing.assert_close(found, values, rtol=1e-4, atol=1e-4)
+
+
+def test_interpolation_from_a_single_point_keeps_its_shape(rng):
+    values = torch.rand(2, 1, 4, generator=rng)
+    points = torch.rand(2, 1, 3, generator=rng)
+    queries = torch.rand(2, 9, 3, generator=rng)
+
+    assert interpolate(values, points, queries).shape == (2, 9, 4)
+
+
+def test_interpolation_gradients_equal_differences(rng):
+    values = torch.rand(1, 6, 4, generator=rng, dtype=torch.float64, requires_grad=True)
+    points = torch.rand(1, 6, 3, generator=rng, dtype=torch.float64, requires_grad=True)
+    queries = torch.rand(1, 9, 3, generator=rng, dtype=torch.float64, requires_grad=True)
+
+    assert torch.autograd.gradcheck(interpolate, (values, points, queries))
+
+
+def iou(predictions, parts, part):
+    """Return the intersection over union of one part."""
+    predicted = predictions == part
+    labelled = parts == part
+    both = (predicted & labelled).sum()
+    either = (predicted | labelled).sum()
+    return (both / either).item()
+
+
+@pytest.fixture
+def halves(rng):
+    """Clouds with two halves, x above 0 and below."""
     points = torch.randn(3, 200, 3, generator=rng)
-    parts = points[..., 0].gt(0).long()
+    parts = (points[..., 0] > 0).long()
+    labels = torch.zeros(3, dtype=torch.int64)
+    return Batch(points, labels, parts=parts)
+
+
+def test_all_points_are_scored_from_few(halves):
     task = Segmentation(Halves(), 2)
-    batch = Batch(points, torch.zeros(3, dtype=torch.int64), parts=parts)
-    few = task.step(batch, points[:, :25])
-    assert few.predictions.shape == few.targets.shape == (3, 200)
-    right = few.predictions.eq(parts).float().mean()
+
+    few = task.step(halves, halves.points[:, :25])
+
+    assert few.predictions.shape == (3, 200)
+    assert few.targets.shape == (3, 200)
+    right = few.predictions.eq(halves.parts).float().mean()
     assert 0.7 < right < 1
-    losses = {n: task.step(batch, points[:, :n]).losses["cross_entropy"].item() for n in (25, 200)}
-    assert losses[200] < losses[25]
-    same = task.predict(batch, points)
-    copy = task.predict(batch, points.clone())
-    torch.testing.assert_close(same, copy, atol=1e-2, rtol=1e-4)
     metrics = task.metrics()
     metrics.update(few.predictions, few.targets)
     values = metrics.compute()
     assert values["point_accuracy"] == pytest.approx(right.item())
-    both = [(few.predictions == k) & (parts == k) for k in (0, 1)]
-    either = [(few.predictions == k) | (parts == k) for k in (0, 1)]
-    ious = [(a.sum() / b.sum()).item() for a, b in zip(both, either, strict=True)]
-    assert values["mean_iou"] == pytest.approx(sum(ious) / 2, abs=1e-6)
+    left_iou = iou(few.predictions, halves.parts, 0)
+    right_iou = iou(few.predictions, halves.parts, 1)
+    mean_iou = (left_iou + right_iou) / 2
+    assert values["mean_iou"] == pytest.approx(mean_iou, abs=1e-6)
+
+
+def test_loss_of_all_points_is_below_that_of_few(halves):
+    task = Segmentation(Halves(), 2)
+
+    few = task.step(halves, halves.points[:, :25])
+    every = task.step(halves, halves.points)
+
+    assert every.losses["cross_entropy"] < few.losses["cross_entropy"]
+
+
+def test_prediction_of_a_copy_of_the_points_is_the_same(halves):
+    task = Segmentation(Halves(), 2)
+
+    same = task.predict(halves, halves.points)
+    copy = task.predict(halves, halves.points.clone())
+
+    torch.testing.assert_close(same, copy, atol=1e-2, rtol=1e-4)
+
+
+def test_segmentation_without_parts_is_refused(halves):
+    task = Segmentation(Halves(), 2)
+    without_parts = halves._replace(parts=None)
+
     with pytest.raises(UserError, match="needs clouds whose points have parts"):
-        task.step(batch._replace(parts=None), points)
+        task.step(without_parts, halves.points)
+
+
+def test_segmentation_into_one_part_is_refused():
     with pytest.raises(UserError, match=r"num_parts must be at least 2, got 1\."):
         Segmentation(Halves(), 1)
 
@@ -81,77 +150,124 @@ def test_all_points_are_scored_from_few(rng):
 def test_points_of_unknown_part_are_neither_learned_nor_scored(rng):
     points = torch.randn(2, 99, 3, generator=rng)
     known = torch.rand(2, 99, generator=rng) > 0.3
-    task = Segmentation(Halves(), 2)
     parts = (points[..., 1] > 0).long()
-    batch = Batch(points, torch.zeros(2).long(), parts=parts.where(known, UNKNOWN))
-    found = task.step(batch, points)
-    loss = F.cross_entropy(task.predict(batch, points)[known], parts[known])
+    labels = torch.zeros(2).long()
+    some_known = Batch(points, labels, parts=parts.where(known, UNKNOWN))
+    none_known = Batch(points, labels, parts=torch.full_like(parts, UNKNOWN))
+    task = Segmentation(Halves(), 2)
+
+    found = task.step(some_known, points)
+    nothing = task.step(none_known, points)
+
+    logits = task.predict(some_known, points)
+    loss = F.cross_entropy(logits[known], parts[known])
     torch.testing.assert_close(found.losses["cross_entropy"], loss)
     scores = task.metrics()(found.predictions, found.targets)
-    assert scores == task.metrics()(found.predictions[known], parts[known])
-    none = task.step(batch._replace(parts=torch.full_like(parts, UNKNOWN)), points)
-    assert none.losses["cross_entropy"] == 0
+    scores_of_known = task.metrics()(found.predictions[known], parts[known])
+    assert scores == scores_of_known
+    assert nothing.losses["cross_entropy"] == 0
 
 
 def test_net_follows_order_of_points(rng):
     net = HierarchicalSegmentation(5, FPSSampler, (20, 8), (8, 16, 16), 4).eval()
     points = torch.randn(2, 40, 3, generator=rng)
     order = torch.randperm(40, generator=rng)
-    found = net(points)
-    assert found.shape == (2, 40, 5)
-    torch.testing.assert_close(net(points[:, order]), found[:, order], atol=1e-4, rtol=1e-4)
+
+    logits = net(points)
+    logits_in_order = net(points[:, order])
+
+    assert logits.shape == (2, 40, 5)
+    torch.testing.assert_close(logits_in_order, logits[:, order], atol=1e-4, rtol=1e-4)
     assert net(points[:, :3]).shape == (2, 3, 5)
-    net.train()(points).square().sum().backward()
-    assert all(p.grad is not None for p in net.parameters())
+
+
+def test_net_trains_every_weight(rng):
+    net = HierarchicalSegmentation(5, FPSSampler, (20, 8), (8, 16, 16), 4).train()
+    points = torch.randn(2, 40, 3, generator=rng)
+
+    net(points).square().sum().backward()
+
+    for name, weights in net.named_parameters():
+        assert weights.grad is not None, name
 
 
 def test_shapes_know_their_parts(tmp_path):
     make = partial(shapes, n_points=256, train_per_class=12, test_per_class=2, cache=tmp_path)
+
     data = make(classes="parts")
+    from_cache = make(classes="parts")
+    alone = make(classes=["chair"])
+    without_parts = make(classes=["chair", "sofa"])
+
     train: Any = data.train
     for label, name in enumerate(data.class_names):
-        found = train.parts[train.labels == label].unique()
-        assert {data.part_names[part] for part in found} <= set(PARTS[name])
-    seat, leg = (data.part_names.index(name) for name in ("seat", "leg"))
+        of_class = train.parts[train.labels == label]
+        names = {data.part_names[part] for part in of_class.unique()}
+        assert names <= set(PARTS[name])
+    seat = data.part_names.index("seat")
+    leg = data.part_names.index("leg")
     for cloud, parts in zip(train.points, train.parts, strict=True):
         if (parts == seat).any():
             height = cloud[:, 1]
             assert height[parts == leg].mean() < height[parts == seat].mean()
-    again: Any = make(classes="parts").train  # from the cache
-    alone = make(classes=["chair"])
-    assert torch.equal(again.parts, train.parts)
+    cached: Any = from_cache.train
+    assert torch.equal(cached.parts, train.parts)
+    is_chair = train.labels == data.class_names.index("chair")
     assert alone.part_names == PARTS["chair"]
-    rows = train.labels == data.class_names.index("chair")
-    assert torch.equal(alone.train.points, train.points[rows])
-    assert train.take(rows).parts.shape == (12, 256)
-    assert make(classes=["chair", "sofa"]).part_names == ()
+    assert torch.equal(alone.train.points, train.points[is_chair])
+    assert train.take(is_chair).parts.shape == (12, 256)
+    assert without_parts.part_names == ()
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".npz"])
-def test_scans_have_parts_of_their_own(suffix, tmp_path, rng):
+@pytest.fixture(params=[".ply", ".npz"])
+def scans(request, tmp_path, rng):
+    """A folder of two scans, whose columns ``kind`` hold other numbers left and right."""
+    suffix = request.param
     for number, kinds in enumerate(([7, 2], [2, 40])):
         points = torch.rand(60, 3, generator=rng).double().numpy()
         kind = np.where(points[:, 0] > 0.5, *kinds).astype(np.int16)
         kind[::4] = -1 - number
         WRITERS[suffix](tmp_path / f"scan{number}{suffix}", Table(points, {"kind": kind}))
-    data = cloud_folder(tmp_path)
+    return tmp_path
+
+
+def test_scans_have_parts_of_their_own(scans):
+    data = cloud_folder(scans)
+
     assert data.part_names == ("2", "7", "40")
     splits: list[Any] = [data.train, data.test]
     for clouds in splits:
         for cloud, parts in zip(clouds.points, clouds.parts, strict=True):
             unknown, low, high = parts.unique().tolist()
             assert unknown == UNKNOWN
-            right = parts == high
-            sides = cloud[right, 0].mean() - cloud[parts == low, 0].mean()
-            assert abs(sides) > 0.3
-    unlabelled = cloud_folder(tmp_path, label=None)
-    assert (unlabelled.train.parts, unlabelled.part_names) == (None, ())
-    assert unlabelled.fingerprint != data.fingerprint
+            x = cloud[:, 0]
+            between = x[parts == high].mean() - x[parts == low].mean()
+            assert abs(between) > 0.3
+
+
+def test_scans_without_label_have_no_parts(scans):
+    labelled = cloud_folder(scans)
+
+    unlabelled = cloud_folder(scans, label=None)
+
+    assert unlabelled.train.parts is None
+    assert unlabelled.part_names == ()
+    assert unlabelled.fingerprint != labelled.fingerprint
+
+
+def test_scans_with_an_unsuitable_label_are_refused(scans):
     with pytest.raises(UserError, match=r"has no column 'part'. Its columns: kind\."):
-        cloud_folder(tmp_path, label="part")
+        cloud_folder(scans, label="part")
     with pytest.raises(UserError, match="label must be null with crop=surface"):
-        cloud_folder(tmp_path, crop="surface", crops=1)
-    write = Table(np.eye(3)[np.arange(60) % 3], {"kind": np.full(60, 0.5)})
-    WRITERS[suffix](tmp_path / f"scan2{suffix}", write)
+        cloud_folder(scans, crop="surface", crops=1)
+
+
+def test_scans_with_broken_numbers_as_labels_are_refused(scans):
+    (first,) = scans.glob("scan0.*")
+    suffix = first.suffix
+    points = np.tile(np.eye(3), (20, 1))
+    kind = np.full(60, 0.5)
+    WRITERS[suffix](scans / f"scan2{suffix}", Table(points, {"kind": kind}))
+
     with pytest.raises(UserError, match=r"'kind' must hold whole int64 numbers, got 0\.5\."):
-        cloud_folder(tmp_path)
+        cloud_folder(scans)

@@ -50,38 +50,57 @@ def test_step_uses_temperature_of_its_progress():
 
     fitted(sampler, epochs=2)
 
-    in_training = [training for training, _, _ in sampler.samples]
-    temperatures = [output.matrix.tau for _, _, output in sampler.samples]
     annealed = [0.2 ** (step / 7) for step in range(8)]  # 2 epochs of 4 batches
-    assert in_training == [True] * 4 + [False] + [True] * 4 + [False]
+    in_training = []
+    temperatures = []
+    for training, _, output in sampler.samples:
+        in_training.append(training)
+        temperatures.append(output.matrix.tau)
+    epoch = [True, True, True, True, False]
+    assert in_training == [*epoch, *epoch]
     assert temperatures == pytest.approx([*annealed[:4], 0.2, *annealed[4:], 0.2])
 
 
 def plain_projected(generated, clouds):
     """The projection on the 3 nearest points at a temperature of 0.7."""
     distances, rows = k_nearest(generated, clouds, 3)
-    cloud = torch.arange(len(clouds))[:, None, None]
-    weights = torch.softmax(-distances / 0.7**2, 2)
-    return (weights[..., None] * clouds[cloud, rows]).sum(2)
+    neighbours = gather_points(clouds, rows)
+    logits = -distances / 0.7**2
+    weights = torch.softmax(logits, 2)
+    return (weights[..., None] * neighbours).sum(2)
+
+
+PROGRESSIVE = partial(noting, ProgressiveSampleNet, 16, **SNET)
 
 
 @pytest.mark.parametrize("kind", [SampleNet, ProgressiveSampleNet])
-def test_task_net_of_samplenet_gets_projected_points_in_training_only(kind, calls):
+def test_task_net_of_samplenet_gets_projected_points_in_training(kind, calls):
     sampler = noting(kind, 8, k=3, **SNET)
     torch.nn.init.constant_(sampler.temperature, 0.7)
 
     fitted(sampler)
 
-    trained = [output for training, _, output in sampler.samples if training]
     sizes = list(sampler.training_sizes())
-    steps = [call for call in calls if call.training]
-    assert sizes_of(steps) == sizes * len(trained)
-    outputs = [output for output in trained for _ in sizes]
-    for call, output in zip(steps, outputs, strict=True):
-        m = call.points.shape[1]
-        generated = output.points[:, :m]
-        torch.testing.assert_close(call.points, plain_projected(generated, call.clouds))
-        assert (call.points - generated).abs().max() > 0.1
+    steps = iter([call for call in calls if call.training])
+    for training, _, output in sampler.samples:
+        if not training:
+            continue
+        for m in sizes:
+            call = next(steps)
+            generated = output.points[:, :m]
+            projected = plain_projected(generated, call.clouds)
+            torch.testing.assert_close(call.points, projected)
+            assert (call.points - generated).abs().max() > 0.1
+    assert next(steps, None) is None
+
+
+@pytest.mark.parametrize("kind", [SampleNet, ProgressiveSampleNet])
+def test_task_net_of_samplenet_is_scored_on_generated_points(kind, calls):
+    sampler = noting(kind, 8, k=3, **SNET)
+    torch.nn.init.constant_(sampler.temperature, 0.7)
+
+    fitted(sampler)
+
     (scored,) = [output for training, _, output in sampler.samples if not training]
     assert scored.soft_projected is None
     generated, matched, _, projected = [call.points for call in calls if not call.training]
@@ -89,9 +108,6 @@ def test_task_net_of_samplenet_gets_projected_points_in_training_only(kind, call
     assert not torch.equal(generated, matched)
     assert not torch.equal(projected, generated)
     assert not torch.equal(projected, matched)
-
-
-PROGRESSIVE = partial(noting, ProgressiveSampleNet, 16, **SNET)
 
 
 @pytest.mark.parametrize(
@@ -112,11 +128,15 @@ def test_losses_over_sizes_are_summed_or_averaged(how, make, name, loss, calls):
     sizes = sizes_of(calls)
     assert len(sizes) > 2
     assert sizes == sorted(set(sizes))
+    own = 0.0
+    task = 0.0
+    prints = []
     with torch.no_grad():
-        of_sampler = [2 * loss(clouds, output.points[:, :m]) for m in sizes]
-        prints = [module.task.net(call.points) for call in calls]
-    own = float(sum(of_sampler))
-    task = float(sum(one.square().mean() for one in prints))
+        for call, m in zip(calls, sizes, strict=True):
+            own += 2 * float(loss(clouds, output.points[:, :m]))
+            fingerprint = module.task.net(call.points)
+            task += float(fingerprint.square().mean())
+            prints.append(fingerprint)
     if how == "mean":
         own /= len(sizes)
         task /= len(sizes)
@@ -124,10 +144,13 @@ def test_losses_over_sizes_are_summed_or_averaged(how, make, name, loss, calls):
     assert logged["train/loss/task"] == pytest.approx(task, rel=1e-4)
     total = logged["train/loss/total"]
     parts = [value for key, value in logged.items() if key.startswith("train/loss/")]
-    assert 2 * total == pytest.approx(sum(parts), rel=1e-4)
+    assert sum(parts) - total == pytest.approx(total, rel=1e-4)
     assert logged["train/mean_loss"] == pytest.approx(total, rel=1e-4)
     assert logged["loss"] == pytest.approx(total, rel=1e-4)
-    assert logged.get("train/tau") == (1.0 if isinstance(sampler, FMOPSNet) else None)
+    if isinstance(sampler, FMOPSNet):
+        assert logged["train/tau"] == 1.0
+    else:
+        assert "train/tau" not in logged
     readout = "projected" if isinstance(sampler, SampleNet) else "generated"
     mean = float(torch.stack(prints).mean())
     assert logged[f"train/{readout}/fingerprint"] == pytest.approx(mean, abs=1e-4)
@@ -135,12 +158,15 @@ def test_losses_over_sizes_are_summed_or_averaged(how, make, name, loss, calls):
 
 def test_straight_through_losses_are_means_over_generated_and_matched_points(calls):
     recipe = Recipe(straight_through=0.0)
+    sampler = noting(MOPSNet, 8, **MOPS)
 
-    module, logged = fitted(noting(MOPSNet, 8, **MOPS), recipe=recipe, **ONE_STEP)
+    module, logged = fitted(sampler, recipe=recipe, **ONE_STEP)
 
-    generated, matched = [call.points for call in calls]
-    clouds = calls[0].clouds
-    torch.testing.assert_close(matched, gather_points(clouds, match(generated, clouds)))
+    generated_call, matched_call = calls
+    generated = generated_call.points
+    clouds = generated_call.clouds
+    matched = gather_points(clouds, match(generated, clouds))
+    torch.testing.assert_close(matched_call.points, matched)
     prints = module.task.net(generated)
     of_generated = float(prints.square().mean())
     of_matched = float(module.task.net(matched).square().mean())
@@ -200,7 +226,8 @@ def test_distillation_targets_are_whole_clouds_and_features_of_seen_points(augme
         reference = seen.relu().amax(1)
     apart = float((predicted - target).square().mean())
     squares = (features - reference).square().sum(1)
-    relative = float((squares / reference.square().sum(1)).mean())
+    reference_squares = reference.square().sum(1)
+    relative = float((squares / reference_squares).mean())
     assert logged["train/loss/distillation"] == pytest.approx(3 * apart, rel=1e-4)
     assert logged["train/loss/feature_distillation"] == pytest.approx(relative / 2, rel=1e-4)
 
@@ -218,8 +245,9 @@ def test_losses_under_several_nets_are_means_and_scores_of_the_first(calls):
         mean = (of_first[key] + of_other[key]) / 2
         assert of_both[key] == pytest.approx(mean, rel=1e-4)
     assert of_first["train/loss/task"] != pytest.approx(of_other["train/loss/task"], rel=0.1)
-    scores = [name for name in of_first if "loss" not in name]
-    assert [of_both[name] for name in scores] == [of_first[name] for name in scores]
+    for name, score in of_first.items():
+        if "loss" not in name:
+            assert of_both[name] == score
 
 
 def logged_under(*nets):
@@ -228,8 +256,10 @@ def logged_under(*nets):
     task, *others = [ComparedTask(net) for net in nets]
     sampler = noting(MOPSNet, 8, **MOPS)
     module, logged = fitted(sampler, task=task, others=others, recipe=recipe, epochs=2)
-    assert not any(net.weight.requires_grad for net in nets)
-    assert not any(other.training for other in module.other_tasks)
+    for net in nets:
+        assert not net.weight.requires_grad
+    for other in module.other_tasks:
+        assert not other.training
     return logged
 
 
@@ -255,9 +285,10 @@ def test_nets_drawn_in_a_step_are_compared_with_predictions_of_the_first(calls):
     numbers = [tasks.index(task) for task, _, _ in used]
     assert len(numbers) == 8 * 3
     assert numbers[::3] == [0] * 8
-    for one, other in zip(numbers[1::3], numbers[2::3], strict=True):
-        assert one != other
-        assert 0 not in (one, other)
+    for drawn, also_drawn in zip(numbers[1::3], numbers[2::3], strict=True):
+        assert drawn != 0
+        assert also_drawn != 0
+        assert drawn != also_drawn
     assert set(numbers) == {0, 1, 2, 3}
     apart = 0.0
     with torch.no_grad():
@@ -283,17 +314,19 @@ class WithMoreInTests(RecordingTask):
 def test_training_logs_means_over_clouds_of_uneven_batches():
     module = Experiment(WithMoreInTests(Fingerprint()), None, "task", STILL)
     data = numbered_clouds()
+    train = CloudLoader(data.train, 6)
+    val = CloudLoader(data.test, 4)
     trainer = quiet_trainer(1, limit_val_batches=0)
 
-    trainer.fit(module, CloudLoader(data.train, 6), CloudLoader(data.test, 4))
+    trainer.fit(module, train, val)
 
     prints = module.task.net(data.train.points).detach()
+    loss_of_last_batch = prints[12:].square().mean()
     logged = trainer.callback_metrics
     torch.testing.assert_close(logged["train/mean_loss"], prints.square().mean())
     torch.testing.assert_close(logged["train/full/fingerprint"], prints.mean())
+    torch.testing.assert_close(logged["train/loss/total"], loss_of_last_batch)
     assert "train/full/in_tests" not in logged
-    # Of the last batch.
-    torch.testing.assert_close(logged["train/loss/total"], prints[12:].square().mean())
     assert set(trainer.progress_bar_metrics) == {"loss"}
     assert "loss" not in trainer.logged_metrics
 
@@ -337,20 +370,23 @@ def test_schedule_sets_rate_of_each_step_of_the_run():
 def test_step_follows_the_gradient_of_the_total_loss(learn, calls):
     task = RecordingTask(Fingerprint())
     sampler = MOPSNet(8, **MOPS)
-    old_task, old_sampler = copy.deepcopy((task, sampler))
+    old_task = copy.deepcopy(task)
+    old_sampler = copy.deepcopy(sampler)
     trained = None if learn == "task" else sampler
     module = Experiment(task, trained, learn, partial(torch.optim.SGD, lr=0.01))
     data = numbered_clouds()
     train = CloudLoader(data.train, 4, shuffle=True)
+    val = CloudLoader(data.test, 4)
 
-    quiet_trainer(1, **ONE_STEP).fit(module, train, CloudLoader(data.test, 4))
+    quiet_trainer(1, **ONE_STEP).fit(module, train, val)
 
-    ((_, clouds, _, _),) = calls
+    (call,) = calls
     if learn == "task":
-        loss = old_task.net(clouds).square().mean()
+        loss = old_task.net(call.clouds).square().mean()
     else:
-        points = old_sampler.train()(clouds).points
-        loss = old_task.net(points).square().mean() + 2 * subset_loss(clouds, points)
+        points = old_sampler.train()(call.clouds).points
+        task_loss = old_task.net(points).square().mean()
+        loss = task_loss + 2 * subset_loss(call.clouds, points)
     loss.backward()
     assert_stepped(old_task, task, learn != "sampler")
     assert_stepped(old_sampler, sampler, learn != "task")

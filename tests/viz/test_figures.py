@@ -14,7 +14,8 @@ from mops_lightning.viz.task_results import ReconstructionResult, reconstruction
 
 
 def pixels(figure, tmp_path):
-    return matplotlib.image.imread(figures.save_figure(figure, tmp_path / "figure.png"))[..., :3]
+    path = figures.save_figure(figure, tmp_path / "figure.png")
+    return matplotlib.image.imread(path)[..., :3]
 
 
 def marked(image, name):
@@ -34,6 +35,11 @@ def column_of(image, number, columns):
     return image[:, number * width : (number + 1) * width]
 
 
+def marked_in_column(image, number, columns, name):
+    """Return the number of pixels in the colour of a readout, in one column of a grid."""
+    return marked(column_of(image, number, columns), name)
+
+
 def test_cloud_grid_draws_readout_in_its_colour(tmp_path, rng):
     points = torch.rand(2, 300, 3, generator=rng)
     samples = points[:, :20]
@@ -42,9 +48,9 @@ def test_cloud_grid_draws_readout_in_its_colour(tmp_path, rng):
     figure = figures.cloud_grid(points, readouts, ["chair", "vase"])
 
     image = pixels(figure, tmp_path)
-    assert marked(column_of(image, 1, 4), "generated") > 200
-    assert marked(column_of(image, 2, 4), "matched") > 200
-    assert marked(column_of(image, 3, 4), "completed") > 200
+    assert marked_in_column(image, 1, 4, "generated") > 200
+    assert marked_in_column(image, 2, 4, "matched") > 200
+    assert marked_in_column(image, 3, 4, "completed") > 200
 
 
 def test_cloud_grid_names_clouds_and_readouts(rng):
@@ -62,45 +68,57 @@ def test_cloud_grid_names_clouds_and_readouts(rng):
 @pytest.mark.parametrize("number", [30, 1000])
 def test_matrix_figure_shows_ideal_matrix_as_diagonal_and_every_large_entry(number):
     dense = torch.zeros(number, 4)
-    rows = torch.tensor([number // 2, 3, number - 1, 7])
-    dense[rows, torch.arange(4)] = 1.0
+    dense[number // 2, 0] = 1.0
+    dense[3, 1] = 1.0
+    dense[number - 1, 2] = 1.0
+    dense[7, 3] = 1.0
+    gram = dense.T @ dense
 
-    figure = figures.matrix_figure(dense, dense.T @ dense, "chair")
+    figure = figures.matrix_figure(dense, gram, "chair")
 
-    left = figure.axes[0].images[0]
-    right = figure.axes[1].images[0]
+    (left,) = figure.axes[0].images
+    (right,) = figure.axes[1].images
     drawn = np.asarray(left.get_array())
     assert drawn.max(0).tolist() == [1.0, 1.0, 1.0, 1.0]
     if number == 30:
-        assert (np.diff(drawn.argmax(0)) > 0).all()
+        rows = drawn.argmax(0)
+        assert (np.diff(rows) > 0).all()
     assert list(left.get_extent()) == [-0.5, 3.5, number - 0.5, -0.5]
-    np.testing.assert_array_equal(np.asarray(right.get_array()), np.eye(4))
+    drawn_gram = np.asarray(right.get_array())
+    np.testing.assert_array_equal(drawn_gram, np.eye(4))
 
 
 def test_cloud_grid_draws_samples_over_dense_cloud(tmp_path, rng):
     points = F.normalize(torch.randn(8192, 3, generator=rng), dim=1)
-    far = points[points[:, 0] < -0.3][:100]
+    is_far = points[:, 0] < -0.3
+    far = points[is_far][:100]
     readouts = {"matched": far[None]}
 
-    over_dense = pixels(figures.cloud_grid(points[None], readouts, [""]), tmp_path)
-    alone = pixels(figures.cloud_grid(far[None], readouts, [""]), tmp_path)
+    over_dense = figures.cloud_grid(points[None], readouts, [""])
+    alone = figures.cloud_grid(far[None], readouts, [""])
 
+    marked_over_dense = marked(pixels(over_dense, tmp_path), "matched")
+    marked_alone = marked(pixels(alone, tmp_path), "matched")
     # Without the hiding cloud the frame is tighter, hence markers cover more pixels.
-    assert marked(over_dense, "matched") > 0.2 * marked(alone, "matched")
+    assert marked_over_dense > 0.2 * marked_alone
 
 
 def test_comparison_draws_every_sample_and_whole_cloud(tmp_path, rng):
     points = torch.rand(300, 3, generator=rng)
-    samples = {"fps": points[:20], "generated": points[:20]}
-    captions = {"fps": "fps: 78.75 %", "generated": "MOPSNet: 96.25 %", "full": "all points"}
+    sample = points[:20]
+    captions = {
+        "fps": "fps: 78.75 %",
+        "generated": "MOPSNet: 96.25 %",
+        "full": "all points",
+    }
 
-    figure = figures.comparison(points, samples, captions)
+    figure = figures.comparison(points, {"fps": sample, "generated": sample}, captions)
 
     titles = [axes.get_title() for axes in figure.axes]
     assert titles == ["fps: 78.75 %", "MOPSNet: 96.25 %", "all points"]
     image = pixels(figure, tmp_path)
-    assert marked(column_of(image, 0, 3), "sampled") > 200
-    assert marked(column_of(image, 1, 3), "generated") > 200
+    assert marked_in_column(image, 0, 3, "sampled") > 200
+    assert marked_in_column(image, 1, 3, "generated") > 200
 
 
 def test_save_figure_png_has_a_palette_near_the_colours(tmp_path):
@@ -113,9 +131,10 @@ def test_save_figure_png_has_a_palette_near_the_colours(tmp_path):
     with Image.open(path) as image:
         assert image.size == (400, 400)
         assert image.mode == "P"
-        drawn = np.asarray(image.convert("RGB")).reshape(-1, 3) / 255
+        drawn = np.asarray(image.convert("RGB")) / 255
     for colour in colours.reshape(-1, 3):
-        assert np.abs(drawn - colour).max(1).min() < 0.02
+        distances = np.abs(drawn - colour).max(2)
+        assert distances.min() < 0.02
 
 
 def test_save_clouds_large_thins_input_and_keeps_samples(tmp_path, rng):
@@ -179,28 +198,43 @@ def test_reconstruction_grid_thins_large_clouds_only(rng):
     assert reconstruction.texts[0].get_text() == "NRE 1.50"
 
 
+def offsets_of(collection):
+    return np.asarray(collection.get_offsets())
+
+
 def drawn_points(axes):
     """Return the number of points of every collection of axes."""
-    return [len(np.asarray(drawn.get_offsets())) for drawn in axes.collections]
+    return [len(offsets_of(collection)) for collection in axes.collections]
+
+
+UPRIGHT_AXES = {
+    "x": [2, 0, 1],
+    "y": [0, 1, 2],
+    "z": [1, 2, 0],
+}
+"""The axes to the right, up and to the viewer."""
 
 
 @pytest.mark.parametrize("up", ["x", "y", "z"])
 def test_view_upright_draws_the_upper_end_above_and_no_mirror_image(up):
-    turn = {"x": [2, 0, 1], "y": [0, 1, 2], "z": [1, 2, 0]}[up]
     tripod = torch.zeros(1, 4, 3)  # the origin, and one step to the right, up and to the viewer
-    tripod[0, 1:] = torch.eye(3)[turn]
+    tripod[0, 1:] = torch.eye(3)[UPRIGHT_AXES[up]]
     figure = figures.cloud_grid(tripod, {}, [""])
 
     figures.view_upright(figure, up)
 
     axes: Any = figure.axes[0]
-    drawn = figures.upright(tripod)[0]
-    flat = np.array([proj3d.proj_transform(*point, axes.get_proj())[:2] for point in drawn])
+    projection = axes.get_proj()
+    flat = []
+    for point in figures.upright(tripod)[0]:
+        x, y, _ = proj3d.proj_transform(*point, projection)
+        flat.append(np.array([x, y]))
     origin, right, above, front = flat
-    upwards = above - origin
-    assert upwards[1] > 10 * abs(upwards[0])
+    sideways, upwards = above - origin
+    assert upwards > 10 * abs(sideways)
     # Turned about the vertical, the other two keep their order: seen from above, anticlockwise.
-    assert np.linalg.det([front - origin, right - origin]) > 0
+    ground = np.stack([front - origin, right - origin])
+    assert np.linalg.det(ground) > 0
 
 
 @pytest.mark.parametrize("up", ["x", "y", "z"])
@@ -214,33 +248,46 @@ def test_to_y_up_is_a_rotation_that_raises_the_vertical_axis(up):
 def test_colours_by_channel_have_one_scale_for_all_sets():
     points = torch.zeros(1, 101, 4)
     points[0, :, 3] = torch.arange(101)
-    sample = points[:, [0, 50, 100]]
+    rows = [0, 50, 100]
 
-    colours = figures.colours_by_channel(3, {"input": points, "sampled": sample})
+    colours = figures.colours_by_channel(3, {"input": points, "sampled": points[:, rows]})
 
-    assert colours["input"].shape == (1, 101, 3)
-    np.testing.assert_array_equal(colours["sampled"], colours["input"][:, [0, 50, 100]])
-    dark, middle, bright = colours["sampled"][0].sum(1)
+    of_input = colours["input"]
+    of_sample = colours["sampled"]
+    assert of_input.shape == (1, 101, 3)
+    np.testing.assert_array_equal(of_sample, of_input[:, rows])
+    dark, middle, bright = of_sample[0].sum(1)
     assert dark < middle < bright
 
 
 def test_colours_by_a_constant_channel_are_equal():
-    colours = figures.colours_by_channel(3, {"input": torch.ones(2, 9, 4)})
+    points = torch.ones(2, 9, 4)
 
-    assert len(np.unique(colours["input"].reshape(-1, 3), axis=0)) == 1
+    colours = figures.colours_by_channel(3, {"input": points})
+
+    different = np.unique(colours["input"].reshape(-1, 3), axis=0)
+    assert len(different) == 1
+
+
+BRIGHT = np.array([253, 231, 37]) / 255
+
+
+DARK = np.array([68, 1, 84]) / 255
 
 
 def test_cloud_grid_draws_points_in_the_colours_of_a_channel(tmp_path, rng):
     points = torch.rand(1, 300, 4, generator=rng)
-    points[..., 3] = (points[..., 1] > 0.5).float()  # bright above, dark below
+    is_above = points[..., 1] > 0.5
+    points[..., 3] = is_above.float()  # bright above, dark below
+    readouts = {"sampled": points[:, :40]}
 
-    figure = figures.cloud_grid(points, {"sampled": points[:, :40]}, ["a cloud"], channel=3)
+    figure = figures.cloud_grid(points, readouts, ["a cloud"], channel=3)
 
     image = pixels(figure, tmp_path)
     for number in (0, 1):
         column = column_of(image, number, 2)
-        bright = near_colour(column, np.array([253, 231, 37]) / 255, 0.1)
-        dark = near_colour(column, np.array([68, 1, 84]) / 255, 0.1)
-        assert bright.sum() > 50
-        assert dark.sum() > 50
-        assert bright.nonzero()[0].mean() < dark.nonzero()[0].mean()
+        bright_rows, _ = near_colour(column, BRIGHT, 0.1).nonzero()
+        dark_rows, _ = near_colour(column, DARK, 0.1).nonzero()
+        assert len(bright_rows) > 50
+        assert len(dark_rows) > 50
+        assert bright_rows.mean() < dark_rows.mean()

@@ -1,7 +1,6 @@
 """LAS and LAZ files."""
 
 import io
-import itertools
 import struct
 
 import laspy
@@ -31,17 +30,30 @@ def las_cloud(header, number, low=0, high=9):
 
 
 def test_las_keeps_format_scale_and_dimensions(tmp_path):
+    source = tmp_path / "a.las"
+    copy = tmp_path / "b.las"
     header = laspy.LasHeader(point_format=6, version="1.4")
-    header.offsets, header.scales = [1000] * 3, [0.01] * 3
+    header.offsets = [1000, 1000, 1000]
+    header.scales = [0.01, 0.01, 0.01]
     cloud = las_cloud(header, 30, 1000, 1001)
     cloud.intensity = np.arange(30)
-    cloud.write(tmp_path / "a.las")
-    table = read(tmp_path / "a.las", 100, 0)
-    WRITERS[".las"](tmp_path / "b.las", table.take(np.array([3, 5])))
-    again = laspy.read(tmp_path / "b.las")
+    cloud.write(source)
+
+    table = read(source, 100, 0)
+    WRITERS[".las"](copy, table.take(np.array([3, 5])))
+
+    again = laspy.read(copy)
     assert again.header.point_format.id == 6
     assert list(again.intensity) == [3, 5]
-    np.testing.assert_array_equal(again.header.scales, [0.01] * 3)
+    np.testing.assert_array_equal(again.header.scales, [0.01, 0.01, 0.01])
+
+
+def read_rows(path, chunked, number):
+    """Read the first rows of a file by blocks, or the whole file."""
+    if chunked:
+        open_cloud_file(path).read(range(number))
+    else:
+        read(path, 9, 0)
 
 
 @pytest.mark.parametrize("chunked", [True, False])
@@ -51,38 +63,52 @@ def test_las_truncated_between_points_is_broken(chunked, tmp_path):
     WRITERS[".las"](path, Table(points))
     with laspy.open(path) as file:
         length = file.header.point_format.size
-    path.write_bytes(path.read_bytes()[: -30 * length])
+    content = path.read_bytes()
+    path.write_bytes(content[: -30 * length])
+
     with pytest.raises(UserError, match="ends after 60 points"):
-        open_cloud_file(path).read(range(90)) if chunked else read(path, 9, 0)
+        read_rows(path, chunked, 90)
 
 
 @pytest.mark.parametrize("size", [500, 3000])
 def test_laz_damaged_is_broken(size, tmp_path):
     path = tmp_path / "a.laz"
-    WRITERS[".laz"](path, Table(np.random.default_rng(1).uniform(0, 50, size=(3000, 3))))
+    points = np.random.default_rng(1).uniform(0, 50, size=(3000, 3))
+    WRITERS[".laz"](path, Table(points))
     content = bytearray(path.read_bytes())
-    content[600:1500] = bytes(np.random.default_rng(2).integers(0, 256, 900, np.uint8))
+    noise = np.random.default_rng(2).integers(0, 256, 900, np.uint8)
+    content[600:1500] = bytes(noise)
     path.write_bytes(content)
+
     with pytest.raises(UserError, match=r"a\.laz is broken"):
         open_cloud_file(path).read(range(size))
 
 
 def test_las_arrays_and_extended_records_are_kept(tmp_path):
+    source = tmp_path / "a.las"
+    copy = tmp_path / "b.laz"
     header = laspy.LasHeader(point_format=6, version="1.4")
     header.add_extra_dim(laspy.ExtraBytesParams(name="Colors", type="3u1"))
     header.add_extra_dim(laspy.ExtraBytesParams(name="Height", type="f4"))
-    header.evlrs = laspy.vlrs.vlrlist.VLRList([laspy.VLR("LASF_Projection", 2112, "", b"WKT")])
+    projection = laspy.VLR("LASF_Projection", 2112, "", b"WKT")
+    header.evlrs = laspy.vlrs.vlrlist.VLRList([projection])
     cloud = las_cloud(header, 30)
-    cloud["Colors"], cloud["Height"] = np.arange(90).reshape(30, 3), np.arange(30)
-    cloud.write(tmp_path / "a.las")
-    parts, table = open_cloud_file(tmp_path / "a.las"), read(tmp_path / "a.las", 9, 0)
-    for one in (table, parts.read(range(30))):
-        assert one.columns["Colors_1"].tolist() == list(range(1, 90, 3))
-    WRITERS[".laz"](tmp_path / "b.laz", table.take(np.array([3, 5])))
-    again = laspy.read(tmp_path / "b.laz")
+    cloud["Colors"] = np.arange(90).reshape(30, 3)
+    cloud["Height"] = np.arange(30)
+    cloud.write(source)
+
+    whole = read(source, 9, 0)
+    by_rows = open_cloud_file(source).read(range(30))
+    WRITERS[".laz"](copy, whole.take(np.array([3, 5])))
+
+    second_colour = list(range(1, 90, 3))
+    assert whole.columns["Colors_1"].tolist() == second_colour
+    assert by_rows.columns["Colors_1"].tolist() == second_colour
+    again = laspy.read(copy)
     assert again["Colors"].tolist() == [[9, 10, 11], [15, 16, 17]]
     assert list(again["Height"]) == [3, 5]
-    assert [record.string for record in again.evlrs] == ["WKT"]
+    (record,) = again.evlrs
+    assert record.string == "WKT"
 
 
 def test_copc_is_written_to_las_without_its_index(scan, tmp_path):
@@ -126,11 +152,13 @@ def test_las_impossible_count_is_broken(name, form, place, kind, value, said, tm
 def test_laz_of_64_gigabytes_of_chunks_is_broken(chunked, tmp_path):
     path = tmp_path / "a.laz"
     content = written(path, 3)
-    start = struct.unpack_from("<I", content, 96)[0]
-    struct.pack_into("<I", content, struct.unpack_from("<q", content, start)[0] + 4, 2**32 - 1)
+    (start,) = struct.unpack_from("<I", content, 96)
+    (chunk_table,) = struct.unpack_from("<q", content, start)
+    struct.pack_into("<I", content, chunk_table + 4, 2**32 - 1)
     path.write_bytes(content)
+
     with pytest.raises(UserError, match=r"a\.laz is broken.*4,294,967,295 chunks"):
-        open_cloud_file(path).read(range(9)) if chunked else read(path, 9, 0)
+        read_rows(path, chunked, 9)
 
 
 @pytest.mark.parametrize("form", [0, 1, 2, 3, 6, 7, 8])
@@ -145,7 +173,8 @@ def test_laz_with_extra_bytes_reads(form, tmp_path):
 
 
 def write_scan(path, number):
-    points = np.random.default_rng(0).uniform(0, 100, (number, 3)) * [1, 1, 0.1] + [5e5, 4e6, 0]
+    unit = np.random.default_rng(0).uniform(0, 100, (number, 3))
+    points = unit * [1, 1, 0.1] + [5e5, 4e6, 0]
     write_copc(path, points, spacing=8.0)
     return path
 
@@ -160,28 +189,52 @@ def rows_of(table):
     return set(table.columns["intensity"].astype(int))
 
 
-@pytest.mark.parametrize("bounds", ["500010,4000020,500030,4000050", "5e5,4e6,5,500050,4000090,9"])
+@pytest.mark.parametrize(
+    "bounds",
+    [
+        "500010,4000020,500030,4000050",
+        "5e5,4e6,5,500050,4000090,9",
+    ],
+)
 def test_area_by_bounds_equals_all_points_clipped(bounds, scan, tmp_path):
-    area, whole, plain = Area.parse(bounds, None, None), read(scan, 9, 0), tmp_path / "plain.las"
+    plain = tmp_path / "plain.las"
+    area = Area.parse(bounds, None, None)
     assert area is not None
-    inside = ((whole.points >= area.low) & (whole.points <= area.high)).all(1)
-    expected = rows_of(whole.take(np.flatnonzero(inside)))
+    whole = read(scan, 9, 0)
     write(plain, whole)
-    for name in (scan, plain):
-        assert rows_of(read(name, 9, 0, area)) == expected
-        parts = open_cloud_file(name, area)
-        found = [rows_of(parts.read(rows)) for rows in parts.row_ranges(700)]
-        assert sum(map(len, found)) == len(set.union(*found)) == len(expected)
+    above_low = whole.points >= area.low
+    below_high = whole.points <= area.high
+    inside = (above_low & below_high).all(1)
+    expected = rows_of(whole.take(np.flatnonzero(inside)))
+
+    for path in (scan, plain):
+        assert rows_of(read(path, 9, 0, area)) == expected
+        file = open_cloud_file(path, area)
+        found = []
+        for rows in file.row_ranges(700):
+            found.extend(rows_of(file.read(rows)))
+        assert len(found) == len(expected)
+        assert set(found) == expected
 
 
 @pytest.mark.parametrize(
-    ("level", "resolution", "depth"), [(0, None, 0), (2, None, 2), (None, 4.1, 1), (None, 0.1, 9)]
+    ("level", "resolution", "depth"),
+    [
+        (0, None, 0),
+        (2, None, 2),
+        (None, 4.1, 1),
+        (None, 0.1, 9),
+    ],
 )
 def test_area_by_level_reads_the_levels_above(level, resolution, depth, scan):
     area = Area.parse(None, level, resolution)
+    levels = range(depth + 1)
     with laspy.CopcReader.open(scan) as reader:
-        expected = set(reader.query(level=range(depth + 1)).intensity)
-    assert rows_of(read(scan, 9, 0, area)) == expected
+        expected = set(reader.query(level=levels).intensity)
+
+    table = read(scan, 9, 0, area)
+
+    assert rows_of(table) == expected
 
 
 def test_one_percent_of_copc_reads_less_than_a_tenth(tmp_path, monkeypatch):
@@ -214,12 +267,23 @@ def test_copc_damaged_is_broken(scan):
 
 
 def test_box_outside_of_las_or_file_without_levels_says_so(scan, tmp_path):
+    elsewhere = Area.parse("0,0,9,9", None, None)
     with pytest.raises(UserError, match=r"scan\.copc\.laz are in 500000\.\d+,4000000"):
-        read(scan, 9, 0, Area.parse("0,0,9,9", None, None))
+        read(scan, 9, 0, elsewhere)
+
     for suffix in (".las", ".npy", ".xyz"):
-        WRITERS[suffix](tmp_path / f"a{suffix}", Table(np.eye(3)))
+        path = tmp_path / f"a{suffix}"
+        WRITERS[suffix](path, Table(np.eye(3)))
         with pytest.raises(UserError, match="need a COPC file"):
-            read(tmp_path / f"a{suffix}", 9, 0, Area(level=1))
+            read(path, 9, 0, Area(level=1))
+
+
+def joined_points(tables):
+    return np.concatenate([table.points for table in tables])
+
+
+def joined_intensities(tables):
+    return np.concatenate([table.columns["intensity"] for table in tables])
 
 
 @pytest.mark.parametrize("form", [3, 6])
@@ -230,33 +294,48 @@ def test_laz_with_chunks_of_any_size_is_read_by_rows(form, sizes, tmp_path):
     whole = laspy.read(path)
 
     file = open_cloud_file(path)
-    rows = [np.arange(start, stop) for start, stop in itertools.pairwise([0, 50, 90, 371, 400])]
-    tables = [file.read(range(part[0], part[-1] + 1)) for part in rows]
+    tables = [
+        file.read(range(0, 50)),
+        file.read(range(50, 90)),
+        file.read(range(90, 371)),
+        file.read(range(371, 400)),
+    ]
 
-    found = np.concatenate([table.columns["intensity"] for table in tables])
-    np.testing.assert_array_equal(found, np.arange(400))
-    np.testing.assert_array_equal(np.concatenate([t.points for t in tables]), whole.xyz)
+    np.testing.assert_array_equal(joined_intensities(tables), np.arange(400))
+    np.testing.assert_array_equal(joined_points(tables), whole.xyz)
 
 
-@pytest.mark.parametrize("rows", [range(0, 400), range(3, 5), range(250, 400), range(370, 371)])
+@pytest.mark.parametrize(
+    "rows",
+    [
+        range(0, 400),
+        range(3, 5),
+        range(250, 400),
+        range(370, 371),
+    ],
+)
 def test_large_chunk_is_decompressed_in_steps(rows, tmp_path, monkeypatch):
     monkeypatch.setattr(chunks, "LARGEST", 80)
     monkeypatch.setattr(chunks, "STEP", 17)
     path = tmp_path / "a.laz"
     write_variable_chunks(path, 6, [70, 300, 30])
+    header = read_header(path)
 
-    found = chunks.read_rows(path, read_header(path), rows)
+    found = chunks.read_rows(path, header, rows)
 
-    intensities = found.view(laspy.PointFormat(6).dtype())["intensity"]
+    record = laspy.PointFormat(6).dtype()
+    intensities = found.view(record)["intensity"]
     assert intensities.tolist() == list(rows)
 
 
 def write_variable_chunks(path, form, sizes):
     """Write a LAZ file whose chunks have the given numbers of points, and rows as intensities."""
+    number = sum(sizes)
     header = laspy.LasHeader(point_format=form, version="1.4")
-    record = laspy.ScaleAwarePointRecord.zeros(sum(sizes), header=header)
-    record.x, record.y, record.z = np.random.default_rng(0).random((3, len(record))) * 9
-    record.intensity = np.arange(len(record))
+    record = laspy.ScaleAwarePointRecord.zeros(number, header=header)
+    coordinates = np.random.default_rng(0).random((3, number)) * 9
+    record.x, record.y, record.z = coordinates
+    record.intensity = np.arange(number)
     header.update(record)
     header.are_points_compressed = True
     laz = lazrs.LazVlr.new_for_compression(form, 0, True)
@@ -264,30 +343,33 @@ def write_variable_chunks(path, form, sizes):
     with path.open("wb") as stream:
         header.write_to(stream)
         compressor = lazrs.LasZipCompressor(stream, laz)
-        for start, number in zip(np.cumsum([0, *sizes]), sizes, strict=False):
-            part = record.array[start : start + number]
-            compressor.compress_many(np.frombuffer(part.tobytes(), np.uint8))
+        start = 0
+        for size in sizes:
+            points = record.array[start : start + size]
+            compressor.compress_many(np.frombuffer(points.tobytes(), np.uint8))
             compressor.finish_current_chunk()
+            start += size
         compressor.done()
 
 
 def test_copc_by_blocks_of_rows_equals_whole_file(scan):
-    whole, file = laspy.read(scan), open_cloud_file(scan)
+    whole = laspy.read(scan)
+    file = open_cloud_file(scan)
 
     tables = [file.read(rows) for rows in file.row_ranges(700)]
 
-    np.testing.assert_array_equal(np.concatenate([t.points for t in tables]), whole.xyz)
-    intensities = np.concatenate([t.columns["intensity"] for t in tables])
-    np.testing.assert_array_equal(intensities, whole.intensity)
+    np.testing.assert_array_equal(joined_points(tables), whole.xyz)
+    np.testing.assert_array_equal(joined_intensities(tables), whole.intensity)
 
 
 def test_real_copc_file_is_read_by_blocks(real_data):
     path = real_data("airborne") / "lone-star.copc.laz"
-    whole, file = laspy.read(path), open_cloud_file(path)
+    whole = laspy.read(path)
+    file = open_cloud_file(path)
 
     tables = [file.read(rows) for rows in file.row_ranges(100_000)]
 
-    np.testing.assert_array_equal(np.concatenate([t.points for t in tables]), whole.xyz)
+    np.testing.assert_array_equal(joined_points(tables), whole.xyz)
 
 
 @pytest.mark.parametrize(
