@@ -214,20 +214,24 @@ def test_local_neighbours_by_a_tree_equal_all_distances(rng, monkeypatch):
     assert nearest_by_tree.shape == (2, 40, 1)
 
 
-def test_local_products_in_loops_equal_gathered_keys(rng):
+def test_column_weights_in_loops_equal_a_softmax_of_gathered_entries(rng, monkeypatch):
     queries = drawn_normal(rng, 2, 5, 37, requires_grad=True)
     keys = drawn_normal(rng, 2, 9, 37, requires_grad=True)
-    rows = torch.randint(9, (2, 5, 4), generator=rng)
+    points = drawn_normal(rng, 2, 9, 3, requires_grad=True)
+    sharpness = torch.rand(2, 5, dtype=torch.float64, generator=rng, requires_grad=True)
+    anchors = torch.randint(9, (2, 5), generator=rng)  # some repeat
+    places = torch.randint(9, (2, 5, 4), generator=rng)
+    inputs = (queries, keys, points, sharpness)
 
-    def products_of(queries, keys):
-        return local_attention.chosen_products(queries, keys, rows)
+    def columns(queries, keys, points, sharpness):
+        entries = local_attention.Entries(points, anchors, places)
+        return local_attention.column_weights(queries, keys, entries, sharpness, 3.0)
 
-    products = products_of(queries, keys)
+    weights = columns(*inputs)
 
-    gathered = gather_points(keys, rows)
-    expected = (gathered * queries[:, :, None]).sum(3)
-    torch.testing.assert_close(products, expected)
-    assert torch.autograd.gradcheck(products_of, (queries, keys))
+    assert torch.autograd.gradcheck(columns, inputs)
+    monkeypatch.setattr(local_attention, "_has_loops", lambda _: False)
+    torch.testing.assert_close(weights, columns(*inputs))
 
 
 def test_weighted_sums_equal_those_of_gathered_rows_and_so_do_their_gradients(rng):

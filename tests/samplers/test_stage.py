@@ -74,7 +74,43 @@ def test_stage_sampler_equals_a_dense_softmax_over_the_host_features(candidates,
     (gradient,) = torch.autograd.grad(output.points.square().sum(), features, retain_graph=True)
     (expected_gradient,) = torch.autograd.grad(expected.square().sum(), features)
     torch.testing.assert_close(gradient, expected_gradient)
-    assert set(output.losses) == {"subset"}
+
+
+def test_stage_sampler_loss_is_alpha_times_the_mean_squared_distance(rng):
+    net = StageMOPSNet(5, 7, alpha=3.0)
+    points = torch.randn(2, 60, 3, generator=rng)
+    output = net.by_features(points, torch.randn(2, 60, 7, generator=rng), 5)
+    squares = torch.tensor([[0.0, 1, 2, 3, 4], [5, 6, 7, 8, 9]])
+
+    losses = net.losses_in_stage(output, squares)
+
+    assert losses == {"subset": torch.tensor(13.5)}
+
+
+def test_hierarchical_net_gives_its_stages_the_distances_to_the_nearest_points(rng):
+    sampler = partial(StageMOPSNet, alpha=2.0, neighbours=4)
+    net = HierarchicalNet(3, sampler, points=(12,), channels=(8, 10), k=4, hidden=8)
+    points = torch.randn(4, 40, 3, generator=rng)
+
+    centres, _ = net.levels(points)[1]
+
+    squares = torch.cdist(centres, points).amin(2).square()
+    torch.testing.assert_close(net.losses["stage1_subset"], 2.0 * squares.mean())
+
+
+@torch.no_grad()
+def test_stage_sampler_keys_without_gradients_equal_those_with_gradients(rng):
+    net = StageMOPSNet(5, 7).double()
+    local = torch.randn(2, 60, 7, dtype=torch.float64, generator=rng)
+    for weights in net.rho_first.parameters():
+        torch.nn.init.normal_(weights)
+    net._keys_from(local)  # running statistics
+    net.eval()
+
+    keys = net._keys_from(local)
+
+    with torch.enable_grad():
+        torch.testing.assert_close(keys, net._keys_from(local).detach())
 
 
 def test_hierarchical_net_trains_its_stages_through_the_host_features(rng):

@@ -7,7 +7,7 @@ of which PointNet++ is the first (Qi et al., NeurIPS 2017).
 import inspect
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -17,10 +17,32 @@ from mops_lightning.channels import PointChannels, coordinates
 from mops_lightning.errors import UserError, check_at_least
 from mops_lightning.nets.layers import PointMLP, check_channels, linear_norm_relu
 from mops_lightning.ops.maxima import max_of_rows
-from mops_lightning.ops.nearest import k_nearest, nearest
+from mops_lightning.ops.moments import neighbourhood_moments
+from mops_lightning.ops.nearest import k_nearest_rows, nearest
 from mops_lightning.ops.points import gather_points
 from mops_lightning.ops.propagation import interpolate
 from mops_lightning.types import SampleOutput
+
+
+@runtime_checkable
+class FeatureSampler(Protocol):
+    """A sampler that reads the features of the net whose stage it samples for."""
+
+    def by_features(self, points: Tensor, features: Tensor, m: int) -> SampleOutput:
+        """Return m of the points ``(B, N, 3)`` with features ``(B, N, C)``."""
+
+
+@runtime_checkable
+class LossInStage(Protocol):
+    """A sampler whose losses need the distances to the nearest points, which a stage knows."""
+
+    def losses_in_stage(self, output: SampleOutput, squares: Tensor) -> dict[str, Tensor]:
+        """Return the weighted losses of a training step.
+
+        Args:
+            output: of the sampler.
+            squares: ``(B, m)`` squared distances of its points to the nearest input points.
+        """
 
 
 class Stage(nn.Module):
@@ -73,25 +95,37 @@ class Stage(nn.Module):
                 "choose sampler@task.net.sampler=fps."
             )
         sizes = self.sampler.training_sizes() if self.training else (self.m,)
-        choose, m = getattr(self.sampler, "by_features", None), min(max(sizes), n)
-        output: SampleOutput = choose(points, features, m) if choose else self.sampler(points, m)
-        self.losses = output.losses
+        m = min(max(sizes), n)
+        output: SampleOutput
+        if isinstance(self.sampler, FeatureSampler):
+            output = self.sampler.by_features(points, features, m)
+        else:
+            output = self.sampler(points, m)
         centres = output.points
-        distances, rows = k_nearest(centres, points, min(self.k, n))
-        mean = distances.mean((1, 2), keepdim=True)
-        r = torch.where(mean > 0, mean, 1.0).sqrt()  # all points may coincide
+        rows = k_nearest_rows(centres, points, min(self.k, n))
+        self.losses = output.losses
+        if self.training and isinstance(self.sampler, LossInStage):
+            squares = (centres - gather_points(points, rows[..., 0])).square().sum(2)
+            self.losses = self.sampler.losses_in_stage(output, squares)
+        offset_moments = neighbourhood_moments(points, centres, rows)
+        r = root_mean_square(offset_moments)
+        scale = torch.cat([r, r, r, *[r * r] * 9], 2)
         edges = max_of_rows(self.feature(features) + self.offset(points / r), rows)
         edges = edges - self.offset(centres / r) + self.centre(carried(output, points, features))
-        offsets = (gather_points(points, rows) - centres[:, :, None]) / r[..., None]
-        edges = edges + self.moments(moments(offsets))
+        edges = edges + self.moments(offset_moments / scale)
         mixed = F.relu(self.norm(edges.flatten(0, 1))).unflatten(0, centres.shape[:2])
         return centres, mixed + self.mlp(mixed).to(mixed)
 
 
-def moments(offsets: Tensor) -> Tensor:
-    """Return the means of offsets ``(B, M, k, 3)`` and of the products o·oᵀ: ``(B, M, 12)``."""
-    products = offsets.mT @ offsets / offsets.shape[2]
-    return torch.cat([offsets.mean(2), products.flatten(2)], 2)
+def root_mean_square(offset_moments: Tensor) -> Tensor:
+    """Return the root mean square ``(B, 1, 1)`` of the lengths of all offsets of a cloud.
+
+    Args:
+        offset_moments: ``(B, M, 12)`` from ``neighbourhood_moments``.
+    """
+    squares = offset_moments[..., 3:].unflatten(2, (3, 3)).diagonal(dim1=2, dim2=3).sum(2)
+    mean = squares.mean(1)[:, None, None]
+    return torch.where(mean > 0, mean, 1.0).sqrt()  # all points may coincide
 
 
 def carried(output: SampleOutput, points: Tensor, features: Tensor) -> Tensor:

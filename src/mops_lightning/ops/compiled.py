@@ -84,20 +84,35 @@ def nearest(queries: Tensor, points: Tensor, k: int) -> Tensor | None:
     """
     if points.device.type != "cpu" or not (points.numel() and queries.numel()):
         return None
+    if k > 1:
+        return _several_nearest(queries, points, k)
     planes, (clouds, n, channels) = _planes(points), points.shape
     flat = queries.detach().to(distance_dtype(points)).contiguous().flatten(1).numpy()
     scratch = np.empty((clouds, n), _integer(planes))
-    if k == 1:
-        parts, fixed = zip(planes, flat, scratch, strict=True), (channels, NEAREST_LEAF)
-        work = NEAREST_LEAF * (n + queries.shape[1]) * clouds
-        rows = _rows(lambda cloud: kernels.nearest(*cloud, *fixed), parts, work)
-        return None if rows is None else rows[..., None]
-    if not bool(points.isfinite().all() and queries.isfinite().all()):
-        return None
-    best = np.full((clouds, k), np.iinfo(scratch.dtype).max, scratch.dtype)
-    several = zip(planes, flat, best, scratch, strict=True)
-    work = n * queries.shape[1] * clouds
-    return _rows(lambda cloud: kernel_neighbours.neighbours(*cloud, channels), several, work)
+    parts, fixed = zip(planes, flat, scratch, strict=True), (channels, NEAREST_LEAF)
+    work = NEAREST_LEAF * (n + queries.shape[1]) * clouds
+    rows = _rows(lambda cloud: kernels.nearest(*cloud, *fixed), parts, work)
+    return None if rows is None else rows[..., None]
+
+
+def _several_nearest(queries: Tensor, points: Tensor, k: int) -> Tensor | None:
+    """Find the k > 1 nearest points; arguments and result as for ``nearest``."""
+    clouds, m, channels = queries.shape
+    dtype = distance_dtype(points)
+    many = points.detach().to(dtype).contiguous().view(clouds, -1).numpy()
+    few = queries.detach().to(dtype).contiguous().view(clouds, -1).numpy()
+    rows = torch.empty(clouds, m, k, dtype=torch.int64)
+    out = rows.view(clouds, -1).numpy()
+
+    def search(part: slice) -> bool:
+        some = out[part].reshape(-1, k)
+        is_finite: bool = kernel_neighbours.neighbours(
+            many[part].reshape(-1), few[part].reshape(-1), len(out[part]), channels, some
+        )
+        return is_finite
+
+    are_finite = _in_threads(search, clouds, work=points.shape[1] * m * clouds)
+    return rows if all(are_finite) else None
 
 
 def winners(features: Tensor, rows: Tensor) -> Tensor | None:
@@ -112,10 +127,24 @@ def winners(features: Tensor, rows: Tensor) -> Tensor | None:
     """
     if features.device.type != "cpu" or features.dtype.itemsize < 4 or not features.numel():
         return None
-    arrays = [part.detach().contiguous().numpy() for part in (features, rows)]
-    clouds = zip(*arrays, strict=True)
-    work = rows.numel() * features.shape[2]
-    return _rows(lambda cloud: kernel_neighbours.winners(*cloud), clouds, work)
+    largest = torch.empty(*rows.shape[:2], features.shape[2], dtype=torch.int64)
+    arrays = [part.detach().contiguous().numpy() for part in (features, rows, largest)]
+
+    def search(part: slice) -> None:
+        kernel_neighbours.winners(*(array[part] for array in arrays))
+
+    _in_threads(search, len(features), work=rows.numel() * features.shape[2])
+    return largest
+
+
+def _in_threads(function: Callable[[slice], Any], clouds: int, work: int) -> list[Any]:
+    """Call a function for parts of the clouds, in threads where that is faster."""
+    workers = min(torch.get_num_threads(), clouds) if work >= THREADS_MIN_WORK else 1
+    if workers == 1:
+        return [function(slice(0, clouds))]
+    parts = np.array_split(np.arange(clouds), workers)
+    with ThreadPoolExecutor(workers) as pool:
+        return list(pool.map(function, [slice(part[0], part[-1] + 1) for part in parts]))
 
 
 def _planes(points: Tensor) -> Array:

@@ -1,62 +1,142 @@
-"""Products with chosen rows and sums of them, compiled by numba for ``ops.local_attention``."""
+"""Columns with few entries and sums of chosen rows, compiled by numba for ``ops.local_attention``.
+
+All clouds of a batch are in one call, because a call with arrays takes 20 µs from Python.
+"""
 
 # mypy: disable-error-code="no-untyped-def"
 
-from mops_lightning.ops.jit import jit_cached, jit_sums
+import math
+
+import numpy as np
+
+from mops_lightning.ops.jit import jit_sums
+
+AT_ONCE = 4
+"""Number of rows that are added at once, so that sums are read and written less often."""
 
 
 @jit_sums
-def products(queries, keys, places, out):
-    """Write ⟨queries[i], keys[places[i, t]]⟩ to ``out[i, t]``."""
-    for i in range(len(queries)):
-        query = queries[i]
-        for t in range(places.shape[1]):
-            key = keys[places[i, t]]
-            total = queries.dtype.type(0)
-            for c in range(len(query)):
-                total += query[c] * key[c]
-            out[i, t] = total
+def columns(queries, keys, points, sharpness, anchors, places, tau, weights):
+    """Write the columns of S: the softmax over t of (⟨q, h⟩ − sharpness · |p − a|²)/τ.
+
+    Args:
+        queries: ``(B, M, C)`` vectors q.
+        keys: ``(B, K, C)`` vectors h of the candidates.
+        points: ``(B, K, 3)`` the candidates p.
+        sharpness: ``(B, M)``.
+        anchors: ``(B, M)`` the place of every anchor a among the candidates.
+        places: ``(B, M, k)`` the candidates of every column.
+        tau: the temperature τ.
+        weights: ``(B, M, k)``, where to write.
+    """
+    clouds, m, k = weights.shape
+    rate = weights.dtype.type(1 / tau)
+    for cloud in range(clouds):
+        for j in range(m):
+            query, anchor = queries[cloud, j], points[cloud, anchors[cloud, j]]
+            line = weights[cloud, j]
+            top = weights.dtype.type(-np.inf)
+            for t in range(k):
+                place = places[cloud, j, t]
+                key, point = keys[cloud, place], points[cloud, place]
+                product = weights.dtype.type(0)
+                for c in range(len(query)):
+                    product += query[c] * key[c]
+                square = weights.dtype.type(0)
+                for axis in range(len(point)):
+                    apart = point[axis] - anchor[axis]
+                    square += apart * apart
+                line[t] = (product - sharpness[cloud, j] * square) * rate
+                top = max(top, line[t])
+            total = weights.dtype.type(0)
+            for t in range(k):
+                line[t] = math.exp(line[t] - top)
+                total += line[t]
+            for t in range(k):
+                line[t] /= total
 
 
-@jit_cached
-def products_backward(gradients, queries, keys, places, query_gradients, key_gradients):
-    """Add the gradients of ``products`` to those of queries and keys."""
-    channels = queries.shape[1]
-    for i in range(len(queries)):
-        query, query_gradient = queries[i], query_gradients[i]
-        for t in range(places.shape[1]):
-            gradient = gradients[i, t]
-            key, key_gradient = keys[places[i, t]], key_gradients[places[i, t]]
-            for c in range(channels):
-                query_gradient[c] += gradient * key[c]
-                key_gradient[c] += gradient * query[c]
+@jit_sums
+def columns_backward(
+    gradients,
+    weights,
+    queries,
+    keys,
+    points,
+    sharpness,
+    anchors,
+    places,
+    tau,
+    query_gradients,
+    key_gradients,
+    point_gradients,
+    sharpness_gradients,
+):
+    """Add the gradients of ``columns`` to the gradients of its arguments."""
+    clouds, m, k = weights.shape
+    rate = weights.dtype.type(1 / tau)
+    rate = weights.dtype.type(1 / tau)
+    for cloud in range(clouds):
+        for j in range(m):
+            query, anchor = queries[cloud, j], anchors[cloud, j]
+            mean = weights.dtype.type(0)
+            for t in range(k):
+                mean += weights[cloud, j, t] * gradients[cloud, j, t]
+            for t in range(k):
+                given = weights[cloud, j, t] * (gradients[cloud, j, t] - mean) * rate
+                place = places[cloud, j, t]
+                key, key_gradient = keys[cloud, place], key_gradients[cloud, place]
+                query_gradient = query_gradients[cloud, j]
+                for c in range(len(query)):
+                    query_gradient[c] += given * key[c]
+                    key_gradient[c] += given * query[c]
+                square = weights.dtype.type(0)
+                factor = weights.dtype.type(-2) * sharpness[cloud, j] * given
+                for axis in range(points.shape[2]):
+                    apart = points[cloud, place, axis] - points[cloud, anchor, axis]
+                    square += apart * apart
+                    point_gradients[cloud, place, axis] += factor * apart
+                    point_gradients[cloud, anchor, axis] -= factor * apart
+                sharpness_gradients[cloud, j] -= given * square
 
 
-@jit_cached
+@jit_sums
 def sums(weights, rows, values, out):
-    """Write the sum of ``weights[i, t] · values[rows[i, t]]`` over t to ``out[i]``."""
-    channels = values.shape[1]
-    for i in range(len(weights)):
-        total = out[i]
-        total[:] = 0
-        for t in range(weights.shape[1]):
-            weight = weights[i, t]
-            line = values[rows[i, t]]
+    """Write the sum of ``weights[b, j, t] · values[b, rows[b, j, t]]`` over t to ``out[b, j]``."""
+    clouds, m, k = weights.shape
+    channels = values.shape[2]
+    whole = k // AT_ONCE * AT_ONCE
+    for cloud in range(clouds):
+        cloud_values = values[cloud]
+        for j in range(m):
+            total, weight, row = out[cloud, j], weights[cloud, j], rows[cloud, j]
             for c in range(channels):
-                total[c] += weight * line[c]
+                total[c] = 0
+            for t in range(0, whole, AT_ONCE):
+                w0, w1, w2, w3 = weight[t], weight[t + 1], weight[t + 2], weight[t + 3]
+                line0, line1 = cloud_values[row[t]], cloud_values[row[t + 1]]
+                line2, line3 = cloud_values[row[t + 2]], cloud_values[row[t + 3]]
+                for c in range(channels):
+                    total[c] += w0 * line0[c] + w1 * line1[c] + w2 * line2[c] + w3 * line3[c]
+            for t in range(whole, k):
+                line0 = cloud_values[row[t]]
+                for c in range(channels):
+                    total[c] += weight[t] * line0[c]
 
 
 @jit_sums
 def sums_backward(gradients, weights, rows, values, weight_gradients, value_gradients):
-    """Add the gradients of ``sums`` to those of weights and values."""
-    channels = values.shape[1]
-    for i in range(len(weights)):
-        gradient = gradients[i]
-        for t in range(weights.shape[1]):
-            weight = weights[i, t]
-            line, line_gradient = values[rows[i, t]], value_gradients[rows[i, t]]
-            product = weights.dtype.type(0)
-            for c in range(channels):
-                product += gradient[c] * line[c]
-                line_gradient[c] += weight * gradient[c]
-            weight_gradients[i, t] += product
+    """Add the gradients of ``sums`` to those of values, and write those of weights."""
+    clouds, m, k = weights.shape
+    for cloud in range(clouds):
+        for j in range(m):
+            gradient = gradients[cloud, j]
+            for t in range(k):
+                weight = weights[cloud, j, t]
+                line = values[cloud, rows[cloud, j, t]]
+                line_gradient = value_gradients[cloud, rows[cloud, j, t]]
+                product = weights.dtype.type(0)
+                for c in range(len(gradient)):
+                    product += gradient[c] * line[c]
+                    line_gradient[c] += weight * gradient[c]
+                weight_gradients[cloud, j, t] = product

@@ -1,35 +1,61 @@
 """Logits and means of columns that choose among a few points each."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mops_lightning.ops import kernel_local
-from mops_lightning.ops.nearest import k_nearest
+from mops_lightning.ops.nearest import k_nearest_rows
 from mops_lightning.ops.points import gather_points
 
 TREE_MIN_WORK = 2**22
 """Number of distances in a cloud from which a tree finds neighbours faster than all distances."""
 
 
-def chosen_products(queries: Tensor, keys: Tensor, places: Tensor) -> Tensor:
-    """Return the products of every query with its own few keys.
+class Entries(NamedTuple):
+    """Where the columns of S have entries.
+
+    Attributes:
+        points: ``(B, K, 3)`` the candidates.
+        anchors: ``(B, M)`` int64, the place of every column's anchor among the candidates.
+        places: ``(B, M, k)`` int64, the candidates of every column.
+    """
+
+    points: Tensor
+    anchors: Tensor
+    places: Tensor
+
+
+def column_weights(
+    queries: Tensor, keys: Tensor, entries: Entries, sharpness: Tensor, tau: float
+) -> Tensor:
+    """Return columns of S: the softmax over the entries of (⟨w, h⟩ − sharpness · |p − a|²)/τ.
 
     Args:
-        queries: ``(B, M, C)``.
-        keys: ``(B, K, C)``.
-        places: ``(B, M, k)`` int64, rows of the keys.
+        queries: ``(B, M, C)``, the vectors w of the columns.
+        keys: ``(B, K, C)``, the vectors h of the candidates.
+        entries: the candidates p of every column, and its anchor a.
+        sharpness: ``(B, M)``.
+        tau: the temperature τ.
 
     Returns:
-        ``(B, M, k)``; gradients flow to queries and keys. On a CPU no ``(B, M, k, C)`` copy of the
-        keys is made.
+        ``(B, M, k)``; gradients flow to queries, keys, points and sharpness. On a CPU no copies of
+        keys or points are made for every entry.
     """
-    if not _has_loops(queries):
-        return (gather_points(keys, places) @ queries[..., None])[..., 0]
-    return _ChosenProducts.apply(queries.contiguous(), keys.contiguous(), places.contiguous())
+    points, anchors, places = entries
+    if _has_loops(queries):
+        floats = [part.contiguous() for part in (queries, keys, points, sharpness)]
+        integers = [part.contiguous() for part in (anchors, places)]
+        weights: Tensor = _ColumnWeights.apply(*floats, *integers, tau)
+        return weights
+    products = (gather_points(keys, places) @ queries[..., None])[..., 0]
+    apart = gather_points(points, places) - gather_points(points, anchors)[:, :, None]
+    logits = products - sharpness[..., None] * apart.square().sum(3)
+    return (logits / tau).softmax(2)
 
 
 def weighted_sums(weights: Tensor, rows: Tensor, values: Tensor) -> Tensor:
@@ -60,44 +86,55 @@ class _WeightedSums(torch.autograd.Function):
     def forward(ctx: Any, weights: Tensor, rows: Tensor, values: Tensor) -> Tensor:
         ctx.save_for_backward(weights, rows, values)
         out = values.new_empty(*weights.shape[:2], values.shape[2])
-        arrays = (part.detach().numpy() for part in (weights, rows, values, out))
-        for cloud in zip(*arrays, strict=True):
-            kernel_local.sums(*cloud)
+        kernel_local.sums(*_arrays(weights, rows, values, out))
         return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, Tensor]:
         weights, rows, values = ctx.saved_tensors
-        weight_gradients = torch.zeros_like(weights)
+        weight_gradients = torch.empty_like(weights)
         value_gradients = torch.zeros_like(values)
         given = gradients[0].contiguous()
         parts = (given, weights, rows, values, weight_gradients, value_gradients)
-        for cloud in zip(*(part.detach().numpy() for part in parts), strict=True):
-            kernel_local.sums_backward(*cloud)
+        kernel_local.sums_backward(*_arrays(*parts))
         return weight_gradients, None, value_gradients
 
 
-class _ChosenProducts(torch.autograd.Function):
+class _ColumnWeights(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, queries: Tensor, keys: Tensor, places: Tensor) -> Tensor:
-        ctx.save_for_backward(queries, keys, places)
-        out = queries.new_empty(places.shape)
-        arrays = (part.detach().numpy() for part in (queries, keys, places, out))
-        for cloud in zip(*arrays, strict=True):
-            kernel_local.products(*cloud)
-        return out
+    def forward(
+        ctx: Any,
+        queries: Tensor,
+        keys: Tensor,
+        points: Tensor,
+        sharpness: Tensor,
+        anchors: Tensor,
+        places: Tensor,
+        tau: float,
+    ) -> Tensor:
+        weights = queries.new_empty(places.shape)
+        floats = _arrays(queries, keys, points, sharpness)
+        kernel_local.columns(*floats, *_arrays(anchors, places), tau, *_arrays(weights))
+        ctx.save_for_backward(weights, queries, keys, points, sharpness, anchors, places)
+        ctx.tau = tau
+        return weights
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None]:
-        queries, keys, places = ctx.saved_tensors
-        query_gradients = torch.zeros_like(queries)
-        key_gradients = torch.zeros_like(keys)
-        parts = (gradients[0].contiguous(), queries, keys, places, query_gradients, key_gradients)
-        for cloud in zip(*(part.detach().numpy() for part in parts), strict=True):
-            kernel_local.products_backward(*cloud)
-        return query_gradients, key_gradients, None
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        weights, *inputs = ctx.saved_tensors
+        floats = inputs[:4]
+        written = [torch.zeros_like(part) for part in floats]
+        kernel_local.columns_backward(
+            *_arrays(gradients[0].contiguous(), weights, *inputs), ctx.tau, *_arrays(*written)
+        )
+        return (*written, None, None, None)
+
+
+def _arrays(*parts: Tensor) -> list[NDArray[Any]]:
+    """Return tensors as arrays of the same memory."""
+    return [part.detach().numpy() for part in parts]
 
 
 def nearest_rows(queries: Tensor, points: Tensor, k: int) -> Tensor:
@@ -116,7 +153,7 @@ def nearest_rows(queries: Tensor, points: Tensor, k: int) -> Tensor:
     work = queries.shape[1] * points.shape[1]
     on_cpu = points.device.type == "cpu" and not torch.compiler.is_compiling()
     if not on_cpu or work < TREE_MIN_WORK:
-        return k_nearest(queries, points, k)[1]
+        return k_nearest_rows(queries, points, k)
     found = []
     for query, cloud in zip(queries.numpy(), points.numpy(), strict=True):
         _, rows = cKDTree(cloud, balanced_tree=False).query(query, k)

@@ -63,13 +63,18 @@ def k_nearest(queries: Tensor, points: Tensor, k: int) -> tuple[Tensor, Tensor]:
     Raises:
         UserError: the shapes do not match, or k is out of range.
     """
+    indices = k_nearest_rows(queries, points, k)
+    differences = queries[:, :, None] - gather_points(points, indices)
+    return differences.square().sum(3), indices
+
+
+@torch.no_grad()
+def k_nearest_rows(queries: Tensor, points: Tensor, k: int) -> Tensor:
+    """Return the indices of ``k_nearest`` alone; arguments and errors as there."""
     _check_shapes(queries, points)
     if not 1 <= k <= points.shape[1]:
         raise UserError(f"k must be from 1 to the number of points N={points.shape[1]}, got {k}.")
-    with torch.no_grad():
-        indices = _search(queries, points, k)
-    differences = queries[:, :, None] - gather_points(points, indices)
-    return differences.square().sum(3), indices
+    return _search(queries, points, k)
 
 
 def chamfer_distance(points: Tensor, others: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from mops_lightning.ops.local_attention import chosen_products, nearest_rows
+from mops_lightning.ops.local_attention import Entries, column_weights, nearest_rows
 from mops_lightning.ops.local_matrix import LocalMatrix
 from mops_lightning.ops.points import distance_dtype, gather_points
 from mops_lightning.samplers.anchors import (
@@ -89,16 +89,16 @@ class LocalAnchors(FPSAnchors):
         candidates = gather_points(places, thinned.rows)
         keys = keys_of(gather_points(points, thinned.rows), thinned.rows).to(places.dtype)
         anchors = gather_points(candidates, thinned.anchors)
-        near = self._neighbours(anchors, candidates)
-        apart = gather_points(candidates, near) - anchors[:, :, None]
-        squares = apart.square().sum(3)
         content = self._content(gather_points(keys, thinned.anchors), m)
-        if self.neighbours is None:  # all candidates in order
-            products = content @ keys.mT
-        else:
-            products = chosen_products(content, keys, near)
-        logits = products - self._sharpness(thinned.unit, m) * squares
-        weights = (logits / tau).softmax(2)
+        sharpness = self._sharpness(thinned.unit, m)
+        if self.neighbours is None:
+            apart = candidates[:, None] - anchors[:, :, None]
+            logits = content @ keys.mT - sharpness[..., None] * apart.square().sum(3)
+            weights = (logits / tau).softmax(2)
+            return LocalMatrix(weights, thinned.rows[:, None].expand_as(weights), points.shape[1])
+        near = nearest_rows(anchors, candidates, min(self.neighbours, candidates.shape[1]))
+        entries = Entries(candidates, thinned.anchors, near)
+        weights = column_weights(content, keys, entries, sharpness, tau)
         rows = thinned.rows.gather(1, near.flatten(1)).view_as(near)
         return LocalMatrix(weights, rows, points.shape[1])
 
@@ -123,20 +123,12 @@ class LocalAnchors(FPSAnchors):
             return wanted
         return wanted if wanted < n else None
 
-    def _neighbours(self, anchors: Tensor, candidates: Tensor) -> Tensor:
-        """Return the places ``(B, m, k)`` of the candidates that columns choose among."""
-        number = candidates.shape[1]
-        if self.neighbours is None:
-            everything = torch.arange(number, device=candidates.device)
-            return everything.expand(*anchors.shape[:2], number)
-        return nearest_rows(anchors, candidates, min(self.neighbours, number))
-
     def _content(self, keys: Tensor, m: int) -> Tensor:
         """Return the vectors ``(B, m, C)`` that are compared with keys."""
         related = keys @ self.relation.to(keys.dtype).mT
         return self.slots[:m].to(keys.dtype) + related / math.sqrt(keys.shape[2])
 
     def _sharpness(self, unit: Tensor, m: int) -> Tensor:
-        """Return 1/s_j² ``(B, m, 1)``."""
+        """Return 1/s_j² ``(B, m)``."""
         width = unit[:, None] * self.log_width[:m].to(unit.dtype).mul(2).exp()
-        return width.clamp_min(SMALLEST**2).reciprocal()[..., None]
+        return width.clamp_min(SMALLEST**2).reciprocal()

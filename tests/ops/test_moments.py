@@ -1,0 +1,33 @@
+"""Moments of neighbourhoods against gathered offsets."""
+
+import torch
+
+from mops_lightning.ops.moments import neighbourhood_moments
+from mops_lightning.ops.points import gather_points
+
+
+def test_neighbourhood_moments_equal_those_of_gathered_offsets_and_so_do_their_gradients(rng):
+    points = torch.randn(2, 9, 3, dtype=torch.float64, generator=rng, requires_grad=True)
+    centres = torch.randn(2, 5, 3, dtype=torch.float64, generator=rng, requires_grad=True)
+    rows = torch.randint(9, (2, 5, 4), generator=rng)  # some repeat
+
+    moments = neighbourhood_moments(points, centres, rows)
+
+    offsets = gather_points(points, rows) - centres[:, :, None]
+    products = offsets[..., :, None] * offsets[..., None, :]
+    torch.testing.assert_close(moments[..., :3], offsets.mean(2))
+    torch.testing.assert_close(moments[..., 3:], products.mean(2).flatten(2))
+    assert torch.autograd.gradcheck(
+        lambda near, middle: neighbourhood_moments(near, middle, rows), (points, centres)
+    )
+
+
+def test_neighbourhood_moments_of_half_precision_are_near_those_in_single(rng):
+    points = torch.randn(2, 9, 3, generator=rng)
+    rows = torch.randint(9, (2, 5, 4), generator=rng)
+    expected = neighbourhood_moments(points, points[:, :5], rows)
+
+    moments = neighbourhood_moments(points.bfloat16(), points[:, :5].bfloat16(), rows)
+
+    assert moments.dtype == torch.bfloat16
+    torch.testing.assert_close(moments.float(), expected, atol=0.1, rtol=0.1)
