@@ -11,6 +11,9 @@ LATE, NET = "+trainer.val_check_interval=100", "task/net=hierarchical"
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
+        (["mm=32"], "mm: no such setting. Did you mean 'm'?"),
+        (["-m", "mm=32,64"], "mm: no such setting. Did you mean 'm'?"),
+        (["samplr=fps"], "samplr: no such setting. Did you mean 'sampler'"),
         (["sampler.alhpa=3"], "sampler.alpha"),
         (["sampler=mosp"], "mops"),
         (["sampler/mops=registration"], "chosen by other groups"),

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from mops_lightning.config import settings
 from mops_lightning.config.declaration import Setting
+from mops_lightning.config.explain import no_such_setting
 from mops_lightning.config.groups import choice_groups
 from mops_lightning.config.overrides import key as key_of
 from mops_lightning.config.overrides import parse_override
@@ -32,18 +33,33 @@ OTHERWISE = {
 def check_overrides(arguments: Sequence[str]) -> None:
     """Refuse ``logger=null`` and the like: Hydra's error has no key, or there is none.
 
+    A mistyped key of the top level is refused here, too: Hydra composes twice before it says so.
+
     Raises:
-        UserError: there is no key, or a group of choices is set to something else than a name.
+        UserError: there is no key, an unknown one, or a group of choices is set to something else
+            than a name.
     """
     groups = choice_groups()
+    known = {*settings.declared(), *groups, "hydra"}
+    has_flags = any(argument.startswith("-") for argument in arguments)  # may name other files
     for argument in arguments:
         override = parse_override(argument)
         name = key_of(argument)
         top = name.partition(".")[0]
         if top == "names":
             raise UserError(f"{argument}: names follow from the chosen groups. Leave it out.")
-        if override is not None:
-            _check(argument, name, override, groups)
+        if override is None:
+            continue
+        _check(argument, name, override, groups)
+        if top not in known and _is_change(override) and not has_flags:
+            raise UserError(no_such_setting(name, arguments))
+
+
+def _is_change(override: "Override") -> bool:
+    """Return whether an override changes a setting, which must exist for that."""
+    is_addition = override.is_add() or override.is_force_add()
+    is_in_group = override.package is not None or "/" in override.key_or_group
+    return not (is_addition or override.is_delete() or is_in_group)
 
 
 def _check(argument: str, name: str, override: "Override", groups: list[str]) -> None:

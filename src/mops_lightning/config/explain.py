@@ -115,7 +115,7 @@ def _from_words(text: str, texts: Sequence[str], arguments: Sequence[str]) -> st
     if refused:
         inside = NOT_IN_STRUCT.search("\n".join(texts))
         named = inside or refused
-        return _no_such_setting(named.group(1), arguments)
+        return no_such_setting(named.group(1), arguments)
     unknown = UNKNOWN_IN_FILE.search(text)
     if unknown:
         file, name = unknown.groups()
@@ -145,8 +145,13 @@ def _is_setting(path: str | None) -> bool:
     return bool(path) and not str(path).startswith("hydra.")
 
 
-def _no_such_setting(key: str, arguments: Sequence[str]) -> str:
-    """Name the nearest group or setting, or say how to set an argument that no YAML file sets."""
+def no_such_setting(key: str, arguments: Sequence[str]) -> str:
+    """Name the nearest group or setting, or say how to set an argument that no YAML file sets.
+
+    Args:
+        key: the unknown key.
+        arguments: the arguments of the command line, or the overrides.
+    """
     groups = choice_groups()
     if key in groups:
         return f"{key}: its files are chosen by other groups. --cfg job shows what they set."
