@@ -74,10 +74,17 @@ def test_chunks_and_tiles_equal_one_pass(budget, scan, tmp_path):
             np.testing.assert_array_equal(part.columns[column], values)
 
 
-def test_spacing_keeps_rows_of_the_op(scan, tmp_path):
-    out = done(scan, tmp_path / "out.npz", "--spacing", 0.7)
+def contents(path):
+    return read(path, 9, 0)
 
-    kept, whole = read(tmp_path / "out.npz", 9, 0), read(scan, 9, 0).finite()
+
+def test_spacing_keeps_rows_of_the_op(scan, tmp_path):
+    result = tmp_path / "out.npz"
+
+    out = done(scan, result, "--spacing", 0.7)
+
+    kept = contents(result)
+    whole = contents(scan).finite()
     rows = keep_spaced(whole.points, 0.7)
     np.testing.assert_array_equal(kept.points, whole.points[rows])
     np.testing.assert_array_equal(kept.columns["row"], whole.columns["row"][rows])
@@ -85,69 +92,122 @@ def test_spacing_keeps_rows_of_the_op(scan, tmp_path):
 
 
 def test_voxel_keeps_one_row_of_each_and_prints_the_origin(scan, tmp_path):
-    out = done(scan, tmp_path / "out.npz", "--voxel", 0.8)
+    result = tmp_path / "out.npz"
 
-    kept, whole = read(tmp_path / "out.npz", 9, 0), read(scan, 9, 0)
-    places = np.unique(np.floor(whole.finite().points / 0.8), axis=0)
-    assert len(kept.points) == len(places)
+    out = done(scan, result, "--voxel", 0.8)
+
+    kept = contents(result)
+    whole = contents(scan)
+    cells = np.floor(whole.finite().points / 0.8)
+    occupied = np.unique(cells, axis=0)
+    assert len(kept.points) == len(occupied)
     np.testing.assert_array_equal(kept.points, whole.points[kept.columns["row"]])
     assert "voxels of 0.8 from the origin 0 0 0" in out
 
 
-def test_voxel_means_average_quantities_and_renormalise_normals(scan, tmp_path):
-    done(scan, tmp_path / "out.npz", "--voxel", 0.8, "--readout", "generated")
+@pytest.fixture(scope="module")
+def voxel_means(scan, tmp_path_factory):
+    """The means of the voxels of 0.8, the points of the scan and the voxel of each."""
+    result = tmp_path_factory.mktemp("means") / "out.npz"
+    done(scan, result, "--voxel", 0.8, "--readout", "generated")
+    whole = contents(scan).finite()
+    cells = np.floor(whole.points / 0.8)
+    _, voxel = np.unique(cells, axis=0, return_inverse=True)
+    return contents(result), whole, voxel
 
-    means, whole = read(tmp_path / "out.npz", 9, 0), read(scan, 9, 0).finite()
-    places, voxel = np.unique(np.floor(whole.points / 0.8), axis=0, return_inverse=True)
-    counts = np.bincount(voxel)
-    for axis in range(3):
-        expected = np.bincount(voxel, whole.points[:, axis]) / counts
-        np.testing.assert_allclose(means.points[:, axis], expected, rtol=0, atol=2e-8)
-    heat = np.bincount(voxel, whole.columns["heat"]) / counts
+
+def mean_by_voxel(voxel, values):
+    return np.bincount(voxel, values) / np.bincount(voxel)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_voxel_means_average_coordinates(axis, voxel_means):
+    means, whole, voxel = voxel_means
+
+    expected = mean_by_voxel(voxel, whole.points[:, axis])
+
+    np.testing.assert_allclose(means.points[:, axis], expected, rtol=0, atol=2e-8)
+
+
+def test_voxel_means_average_quantities_and_renormalise_normals(voxel_means):
+    means, whole, voxel = voxel_means
+
+    heat = mean_by_voxel(voxel, whole.columns["heat"])
+    red = mean_by_voxel(voxel, whole.columns["red"])
+
     np.testing.assert_allclose(means.columns["heat"], heat, rtol=1e-9, atol=1e-3)
-    red = np.bincount(voxel, whole.columns["red"]) / counts
     np.testing.assert_allclose(means.columns["red"], red, atol=0.5)
-    normals = np.stack([means.columns[name] for name in ("nx", "ny", "nz")], axis=1)
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
-    rows = means.columns["row"]
-    assert (voxel[np.searchsorted(whole.columns["row"], rows)] == np.arange(len(places))).all()
+    normals = [means.columns["nx"], means.columns["ny"], means.columns["nz"]]
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=0), 1.0)
+
+
+def test_voxel_means_keep_the_row_of_a_point_of_their_voxel(voxel_means):
+    means, whole, voxel = voxel_means
+
+    places = np.searchsorted(whole.columns["row"], means.columns["row"])
+
+    np.testing.assert_array_equal(voxel[places], np.arange(voxel.max() + 1))
 
 
 @pytest.mark.parametrize("chunk", [[], ["--chunk", 2]])
 def test_voxel_mean_of_a_missing_value_is_missing(chunk, tmp_path):
-    points = np.array([[0.1, 0.1, 0.1], [0.2, 0.2, 0.2], [0.3, 0.3, 0.3], [1.5, 0.5, 0.5]])
+    source = tmp_path / "in.ply"
+    result = tmp_path / "out.npz"
+    points = np.array(
+        [
+            [0.1, 0.1, 0.1],
+            [0.2, 0.2, 0.2],
+            [0.3, 0.3, 0.3],
+            [1.5, 0.5, 0.5],
+        ]
+    )
     heat = np.array([1.0, np.nan, 3.0, 7.0])
-    WRITERS[".ply"](tmp_path / "in.ply", Table(points, {"heat": heat}))
+    WRITERS[".ply"](source, Table(points, {"heat": heat}))
 
-    arguments = ["--voxel", 1, "--readout", "generated", *chunk]
-    done(tmp_path / "in.ply", tmp_path / "out.npz", *arguments)
+    done(source, result, "--voxel", 1, "--readout", "generated", *chunk)
 
-    means = read(tmp_path / "out.npz", 9, 0)
-    np.testing.assert_allclose(means.points, [[0.2, 0.2, 0.2], [1.5, 0.5, 0.5]], atol=1e-9)
+    means = contents(result)
+    expected = [[0.2, 0.2, 0.2], [1.5, 0.5, 0.5]]
+    np.testing.assert_allclose(means.points, expected, atol=1e-9)
     np.testing.assert_array_equal(means.columns["heat"], [np.nan, 7.0])
 
 
 def test_voxel_means_renormalise_normals_by_the_names_of_pcl(tmp_path):
-    points = np.array([[0.1, 0.1, 0.1], [0.2, 0.2, 0.2], [0.3, 0.3, 0.3]])
-    normals = {"normal_x": [1.0, 0.0, 0.0], "normal_y": [0.0, 1.0, 0.0], "normal_z": [0.0] * 3}
-    columns = {name: np.array(values, np.float32) for name, values in normals.items()}
-    WRITERS[".pcd"](tmp_path / "in.pcd", Table(points, columns))
+    source = tmp_path / "in.pcd"
+    result = tmp_path / "out.npz"
+    points = np.array(
+        [
+            [0.1, 0.1, 0.1],
+            [0.2, 0.2, 0.2],
+            [0.3, 0.3, 0.3],
+        ]
+    )
+    columns = {
+        "normal_x": np.array([1.0, 0.0, 0.0], np.float32),
+        "normal_y": np.array([0.0, 1.0, 0.0], np.float32),
+        "normal_z": np.array([0.0, 0.0, 0.0], np.float32),
+    }
+    WRITERS[".pcd"](source, Table(points, columns))
 
-    done(tmp_path / "in.pcd", tmp_path / "out.npz", "--voxel", 1, "--readout", "generated")
+    done(source, result, "--voxel", 1, "--readout", "generated")
 
-    mean = read(tmp_path / "out.npz", 9, 0)
-    values = [float(mean.columns[name][0]) for name in normals]
-    assert values == pytest.approx([2**-0.5, 2**-0.5, 0.0])
+    mean = contents(result).columns
+    assert mean["normal_x"] == pytest.approx([2**-0.5])
+    assert mean["normal_y"] == pytest.approx([2**-0.5])
+    assert mean["normal_z"] == pytest.approx([0.0])
 
 
 def test_map_of_a_spacing(scan, tmp_path):
-    done(scan, tmp_path / "out.npz", "--spacing", 0.7, "--map", tmp_path / "map.npz")
+    result = tmp_path / "out.npz"
+    map_ = tmp_path / "map.npz"
 
-    rows = np.load(tmp_path / "map.npz")["rows"]
-    kept = read(tmp_path / "out.npz", 9, 0).points
-    points = read(scan, 9, 0).points
-    finite = np.isfinite(points).all(axis=1)
-    distances = np.linalg.norm(points[finite] - kept[rows[finite, 0]], axis=1)
+    done(scan, result, "--spacing", 0.7, "--map", map_)
+
+    points = contents(scan).points
+    is_finite = np.isfinite(points).all(axis=1)
+    rows = np.load(map_)["rows"][is_finite, 0]
+    kept = contents(result).points[rows]
+    distances = np.linalg.norm(points[is_finite] - kept, axis=1)
     assert distances.max() < 0.7
 
 
@@ -182,17 +242,19 @@ def test_mistakes_are_one_line(options, words, scan, tmp_path):
 
 @pytest.mark.parametrize("budget", ["--spacing", "--voxel"])
 def test_chunk_of_one_point_reads_longer_ranges(budget, tmp_path, monkeypatch):
+    source = tmp_path / "in.ply"
+    whole = tmp_path / "whole.ply"
+    parts = tmp_path / "parts.ply"
     monkeypatch.setattr(by_distance, "LEAST_CHUNK", 4096)
-    WRITERS[".ply"](tmp_path / "in.ply", Table(RNG.normal(size=(5000, 3))))
+    WRITERS[".ply"](source, Table(RNG.normal(size=(5000, 3))))
+    done(source, whole, budget, 2.5)
     ranges: list[range] = []
     monkeypatch.setattr(by_distance, "_read", watched(by_distance._read, ranges))
-    done(tmp_path / "in.ply", tmp_path / "whole.ply", budget, 2.5)
-    ranges.clear()
 
-    done(tmp_path / "in.ply", tmp_path / "parts.ply", budget, 2.5, "--chunk", 1)
+    done(source, parts, budget, 2.5, "--chunk", 1)
 
-    assert (tmp_path / "parts.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
-    assert {*ranges} == {range(4096), range(4096, 5000)}
+    assert parts.read_bytes() == whole.read_bytes()
+    assert set(ranges) == {range(4096), range(4096, 5000)}
 
 
 def watched(read_part, ranges):
@@ -206,17 +268,22 @@ def watched(read_part, ranges):
 @pytest.mark.parametrize("budget", ["--spacing", "--voxel"])
 @pytest.mark.parametrize("options", [[], ["--chunk", 7]])
 def test_weights_of_zero_are_named(budget, options, tmp_path):
-    WRITERS[".ply"](tmp_path / "in.ply", Table(RNG.normal(size=(20, 3)), {"w": np.zeros(20)}))
-    files = tmp_path / "in.ply", tmp_path / "out.ply"
+    source = tmp_path / "in.ply"
+    points = RNG.normal(size=(20, 3))
+    WRITERS[".ply"](source, Table(points, {"w": np.zeros(20)}))
 
-    words = refused(*files, budget, 1, "--weight", "w", *options)
+    words = refused(source, tmp_path / "out.ply", budget, 1, "--weight", "w", *options)
 
-    assert f"--weight w of {files[0]}: all weights are 0" in words
+    assert f"--weight w of {source}: all weights are 0" in words
 
 
 @pytest.mark.parametrize("budget", ["--spacing", "--voxel"])
 @pytest.mark.parametrize(
-    ("name", "distance"), [("autzen_trim_7.las", 6), ("lone-star.copc.laz", 0.8)]
+    ("name", "distance"),
+    [
+        ("autzen_trim_7.las", 6),
+        ("lone-star.copc.laz", 0.8),
+    ],
 )
 def test_real_scans_in_chunks_equal_one_pass(name, distance, budget, real_data, tmp_path):
     source = real_data(f"airborne/{name}")
@@ -224,7 +291,8 @@ def test_real_scans_in_chunks_equal_one_pass(name, distance, budget, real_data, 
     done(source, tmp_path / "whole.las", budget, distance)
     done(source, tmp_path / "parts.las", budget, distance, "--chunk", 200_000)
 
-    whole, parts = read(tmp_path / "whole.las", 9, 0), read(tmp_path / "parts.las", 9, 0)
+    whole = contents(tmp_path / "whole.las")
+    parts = contents(tmp_path / "parts.las")
     assert len(whole.points) > 100
     np.testing.assert_array_equal(parts.points, whole.points)
     for column, values in whole.columns.items():
@@ -233,20 +301,24 @@ def test_real_scans_in_chunks_equal_one_pass(name, distance, budget, real_data, 
 
 @pytest.mark.parametrize(("kind", "is_refused"), [(2, True), (1, False)])
 def test_degrees_told_by_keys_of_geotiff_are_refused(kind, is_refused, tmp_path):
+    source = tmp_path / "in.las"
+    out = tmp_path / "out.las"
+    version = (1, 1, 0, 2)
+    model = (1024, 0, 1, kind)
+    citation = (1026, 34737, 8, 0)
+    keys = struct.pack("<12H", *version, *model, *citation)
     header = laspy.LasHeader(point_format=3, version="1.2")
     header.scales = np.full(3, 1e-7)
-    citation, model = (1026, 34737, 8, 0), (1024, 0, 1, kind)
-    keys = struct.pack("<12H", 1, 1, 0, 2, *model, *citation)
     header.vlrs.append(laspy.VLR("LASF_Projection", 34735, "", keys))
     las = laspy.LasData(header)
     las.x, las.y, las.z = RNG.uniform(8, 9, (3, 50))
-    las.write(tmp_path / "in.las")
+    las.write(source)
 
     if is_refused:
-        words = refused(tmp_path / "in.las", tmp_path / "out.las", "--voxel", 0.05)
-        assert f"the coordinates of {tmp_path / 'in.las'} are degrees" in words
+        words = refused(source, out, "--voxel", 0.05)
+        assert f"the coordinates of {source} are degrees" in words
     else:
-        done(tmp_path / "in.las", tmp_path / "out.las", "--voxel", 0.05)
+        done(source, out, "--voxel", 0.05)
 
 
 @pytest.mark.parametrize(

@@ -54,15 +54,25 @@ def table():
 
 
 def matrix(table, *names):
-    return np.column_stack([table.points, *(table.columns[name] for name in names)])
+    columns = [table.columns[name] for name in names]
+    return np.column_stack([table.points, *columns])
+
+
+def contents(path):
+    return read(path, 9, 0)
+
+
+GENERATED = ["--m", 9, "--readout", "generated"]
 
 
 def test_columns_are_found_by_name_in_any_order(model, table, tmp_path):
-    WRITERS[".npz"](tmp_path / "in.npz", table)
+    source = tmp_path / "in.npz"
+    out = tmp_path / "out.npz"
+    WRITERS[".npz"](source, table)
 
-    done(tmp_path / "in.npz", tmp_path / "out.npz", "--weights", model, "--m", 9)
+    done(source, out, "--weights", model, "--m", 9)
 
-    kept = read(tmp_path / "out.npz", 9, 0)
+    kept = contents(out)
     expected, rows = load(model).downsample(matrix(table, "Intensity", "ring"), 9)
     np.testing.assert_array_equal(kept.points, expected[:, :3])
     for name, column in table.columns.items():
@@ -70,19 +80,22 @@ def test_columns_are_found_by_name_in_any_order(model, table, tmp_path):
 
 
 def test_generated_points_have_channels_in_the_types_of_the_file(model, table, tmp_path):
-    WRITERS[".npz"](tmp_path / "in.npz", table)
+    source = tmp_path / "in.npz"
+    out = tmp_path / "out.npz"
+    WRITERS[".npz"](source, table)
 
-    settings = ["--weights", model, "--m", 9, "--readout", "generated"]
-    done(tmp_path / "in.npz", tmp_path / "out.npz", *settings)
+    done(source, out, "--weights", model, *GENERATED)
 
-    generated = read(tmp_path / "out.npz", 9, 0)
+    generated = contents(out)
+    intensity = generated.columns["Intensity"]
+    ring = generated.columns["ring"]
     given = matrix(table, "Intensity", "ring")
     expected, _ = load(model).downsample(given, 9, readout="generated")
-    np.testing.assert_allclose(generated.points, expected[:, :3], rtol=1e-6)
-    assert generated.columns["Intensity"].dtype == np.uint16
-    np.testing.assert_allclose(generated.columns["Intensity"], expected[:, 3], atol=0.51)
-    np.testing.assert_allclose(generated.columns["ring"], expected[:, 4], atol=0.51)
     assert list(generated.columns) == ["Intensity", "ring"]
+    np.testing.assert_allclose(generated.points, expected[:, :3], rtol=1e-6)
+    assert intensity.dtype == np.uint16
+    np.testing.assert_allclose(intensity, expected[:, 3], atol=0.51)
+    np.testing.assert_allclose(ring, expected[:, 4], atol=0.51)
 
 
 def test_generated_points_without_attributes_have_coordinates_only(model, table, tmp_path):
@@ -95,15 +108,17 @@ def test_generated_points_without_attributes_have_coordinates_only(model, table,
 
 
 def test_upward_normals_are_written_with_length_one(table, tmp_path):
+    source = tmp_path / "in.ply"
+    out = tmp_path / "out.ply"
     model = save(tmp_path / "model.safetensors", *NORMALS)
-    WRITERS[".ply"](tmp_path / "in.ply", table)
+    WRITERS[".ply"](source, table)
 
-    settings = ["--weights", model, "--m", 9, "--readout", "generated"]
-    done(tmp_path / "in.ply", tmp_path / "out.ply", *settings)
+    done(source, out, "--weights", model, *GENERATED)
 
-    columns = read(tmp_path / "out.ply", 9, 0).columns
-    normals = np.stack([columns[name] for name in ("nx", "ny", "nz")], axis=1)
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), np.ones(9), atol=1e-6)
+    columns = contents(out).columns
+    normals = np.column_stack([columns["nx"], columns["ny"], columns["nz"]])
+    lengths = np.linalg.norm(normals, axis=1)
+    np.testing.assert_allclose(lengths, np.ones(9), atol=1e-6)
     given = np.column_stack([table.points, upward_normals(table.points)])
     expected, _ = load(model).downsample(given, 9, readout="generated")
     np.testing.assert_allclose(normals, expected[:, 3:], atol=1e-4)
@@ -111,13 +126,15 @@ def test_upward_normals_are_written_with_length_one(table, tmp_path):
 
 @pytest.mark.parametrize("readout", ["generated", "matched"])
 def test_chunks_equal_the_whole_file(readout, model, table, tmp_path):
-    WRITERS[".ply"](tmp_path / "in.ply", table)
+    source = tmp_path / "in.ply"
+    WRITERS[".ply"](source, table)
     settings = ["--weights", model, "--m", 9, "--readout", readout]
 
-    done(tmp_path / "in.ply", tmp_path / "whole.npz", *settings)
-    done(tmp_path / "in.ply", tmp_path / "parts.npz", *settings, "--chunk", 70)
+    done(source, tmp_path / "whole.npz", *settings)
+    done(source, tmp_path / "parts.npz", *settings, "--chunk", 70)
 
-    whole, parts = (read(tmp_path / f"{name}.npz", 9, 0) for name in ("whole", "parts"))
+    whole = contents(tmp_path / "whole.npz")
+    parts = contents(tmp_path / "parts.npz")
     np.testing.assert_allclose(parts.points, whole.points, atol=1e-3)
     assert list(parts.columns) == list(whole.columns)
     for name, column in whole.columns.items():
@@ -135,19 +152,21 @@ def test_chunks_do_not_estimate_features(table, tmp_path):
 
 
 def test_tiles_have_the_channels_of_their_points(model, table, tmp_path):
+    reversed_intensity = table.columns["Intensity"][::-1].copy()
+    changed = table.with_columns({"Intensity": reversed_intensity})
     WRITERS[".npz"](tmp_path / "in.npz", table)
-    changed = table.with_columns({"Intensity": table.columns["Intensity"][::-1].copy()})
     WRITERS[".npz"](tmp_path / "changed.npz", changed)
     settings = ["--weights", model, "--m", 20, "--tile", 100]
 
     done(tmp_path / "in.npz", tmp_path / "out.npz", *settings)
     done(tmp_path / "changed.npz", tmp_path / "other.npz", *settings)
 
-    kept = read(tmp_path / "out.npz", 9, 0).points
+    kept = contents(tmp_path / "out.npz").points
+    kept_of_changed = contents(tmp_path / "other.npz").points
     given = matrix(table, "Intensity", "ring")
     in_python, _ = downsample(given, 20, model, tile=100)
     np.testing.assert_array_equal(kept, in_python[:, :3])
-    assert not np.array_equal(kept, read(tmp_path / "other.npz", 9, 0).points)
+    assert not np.array_equal(kept, kept_of_changed)
 
 
 def test_file_without_a_column_is_refused_with_what_it_has(model, table, tmp_path):
@@ -191,13 +210,15 @@ def test_python_names_the_columns_that_a_model_takes(columns, model):
 
 
 def test_compare_samples_with_channels(model, table, tmp_path):
-    WRITERS[".npz"](tmp_path / "in.npz", table)
+    source = tmp_path / "in.npz"
+    WRITERS[".npz"](source, table)
     methods = options_by_method(9, ["fps"], str(model), None, 0)
 
-    result = compare_file(tmp_path / "in.npz", 9, methods, 0)
+    comparison = compare_file(source, 9, methods, 0)
 
-    _, expected = load(model).downsample(matrix(table, "Intensity", "ring"), 9)
-    np.testing.assert_array_equal(result.results[-1].rows, expected)
+    given = matrix(table, "Intensity", "ring")
+    _, expected = load(model).downsample(given, 9)
+    np.testing.assert_array_equal(comparison.results[-1].rows, expected)
 
 
 def test_registration_of_scans_refuses_channels(model):

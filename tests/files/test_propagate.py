@@ -43,8 +43,12 @@ def scan(tmp_path):
     return tmp_path / "big.ply"
 
 
+def distances_between(points, sampled):
+    return np.linalg.norm(points[:, None] - sampled, axis=2)
+
+
 def nearest(points, sampled):
-    return np.linalg.norm(points[:, None] - sampled, axis=2).argmin(1)
+    return distances_between(points, sampled).argmin(1)
 
 
 def write_scan(path, points, **columns):
@@ -67,18 +71,20 @@ def test_map_leads_from_sample_to_all_points(scan, tmp_path):
 
     status, _, err = downsample(scan, small, "--m", 30, "--method", "fps", "--map", map_)
 
-    assert (status, err) == (0, "")
+    assert status == 0
+    assert err == ""
     points = contents(scan).points
     sample = contents(small)
     labels = np.arange(30) + 2**60
     carried = mops_lightning.propagate(labels, map_, fill=-1)
     is_finite = np.isfinite(points).all(1)
-    expected = labels[nearest(points[is_finite], sample.points)]
+    nearest_rows = nearest(points[is_finite], sample.points)
     assert len(carried) == 500
     np.testing.assert_array_equal(carried[~is_finite], -1)
-    np.testing.assert_array_equal(carried[is_finite], expected)
+    np.testing.assert_array_equal(carried[is_finite], labels[nearest_rows])
     rows = np.load(map_)["rows"]
-    assert (rows[sample.columns["intensity"], 0] >= 0).all()
+    rows_of_sample = rows[sample.columns["intensity"], 0]
+    assert (rows_of_sample >= 0).all()
 
 
 def test_map_with_several_rows_averages_scores(scan, tmp_path):
@@ -92,13 +98,15 @@ def test_map_with_several_rows_averages_scores(scan, tmp_path):
 
     assert status == 0
     points = contents(scan).finite().points
-    distances = np.linalg.norm(points[:, None] - contents(small).points, axis=2)
+    distances = distances_between(points, contents(small).points)
     rows = distances.argsort(1)[:, :4]
     near = np.take_along_axis(distances, rows, 1)
     inverse = np.maximum(near, 1e-12) ** -2
-    expected = (scores[rows] * inverse).sum(1) / inverse.sum(1)
+    weights = inverse / inverse.sum(1, keepdims=True)
+    expected = (scores[rows] * weights).sum(1)
     carried = mops_lightning.propagate(scores, map_, fill=np.nan)
-    np.testing.assert_allclose(carried[np.isfinite(carried)], expected, rtol=1e-5)
+    is_finite = np.isfinite(carried)
+    np.testing.assert_allclose(carried[is_finite], expected, rtol=1e-5)
 
 
 def test_map_of_a_folder_gets_one_line(scan, tmp_path):
@@ -135,7 +143,8 @@ def test_labels_reach_all_points(source, target, tmp_path):
     points = random.normal(size=(200, 3)).astype(np.float32).astype(float)
     intensity = np.arange(200, dtype=np.uint16)
     labels = np.arange(20) + 2**30
-    classes = np.array([3] * 10 + [200] * 10, np.uint8)  # a LAS class of old files is below 32
+    classes = np.full(20, 3, np.uint8)
+    classes[10:] = 200  # a LAS class of old files is below 32
     scores = random.random(20)
     columns: dict[str, Any] = {"label": labels, "classification": classes, "score": scores}
     big = tmp_path / f"big{source}"
@@ -169,9 +178,10 @@ def test_points_without_coordinates_are_left_out_and_columns_kept(scan, tmp_path
 
     made = contents(tmp_path / "big_propagated.ply")
     whole = contents(scan).finite()
+    rows = nearest(whole.points, sample.points)
     np.testing.assert_array_equal(made.points, whole.points)
     np.testing.assert_array_equal(made.columns["intensity"], whole.columns["intensity"])
-    np.testing.assert_array_equal(made.columns["label"], nearest(whole.points, sample.points))
+    np.testing.assert_array_equal(made.columns["label"], rows)
 
 
 def test_parts_share_one_tree_of_the_sample(scan, tmp_path, monkeypatch):
@@ -191,9 +201,11 @@ def test_parts_share_one_tree_of_the_sample(scan, tmp_path, monkeypatch):
 
     assert status == 0
     assert len(built) == 1
-    whole = propagation.propagation_map(contents(scan).finite().points, sample.points, 3)
+    points = contents(scan).finite().points
+    whole = propagation.propagation_map(points, sample.points, 3)
+    expected = mops_lightning.propagate(scores, whole)
     made = contents(tmp_path / "big_propagated.ply").columns["score"]
-    np.testing.assert_allclose(made, mops_lightning.propagate(scores, whole), atol=1e-12)
+    np.testing.assert_allclose(made, expected, atol=1e-12)
 
 
 @pytest.mark.parametrize(("target", "name"), [(".ply", "intensity"), (".las", "intensity_")])
@@ -202,11 +214,12 @@ def test_later_parts_may_have_larger_and_broken_numbers(target, name, tmp_path):
     large = np.arange(180) + 2**31 - 70  # int32 holds those of the first part
     intensity = np.full(180, 3.0)
     intensity[101:] = 0.5
+    sample = Table(points[:5], {"label": np.arange(5)})
     small = tmp_path / "small.npz"
     big = tmp_path / "big.npy"
     out = tmp_path / f"out{target}"
     write_scan(big, points, large=large, intensity=intensity)
-    WRITERS[".npz"](small, Table(points[:5], {"label": np.arange(5)}))
+    WRITERS[".npz"](small, sample)
 
     done(main, [small, big, out, *FIELD])
 
@@ -250,11 +263,14 @@ def test_first_part_far_from_the_last_one_keeps_its_place(tmp_path):
 @pytest.fixture
 def line_files(tmp_path):
     """Five points on a line, and a sample of three with a label and a colour."""
+    small = tmp_path / "small.npz"
+    big = tmp_path / "big.npz"
     line = line_of(5)
-    columns = {"label": np.array([5, 9, 9]), "red": np.array([0, 100, 100], np.uint8)}
-    WRITERS[".npz"](tmp_path / "big.npz", Table(line, {}))
-    WRITERS[".npz"](tmp_path / "small.npz", Table(line[[0, 2, 4]], columns))
-    return [tmp_path / "small.npz", tmp_path / "big.npz"]
+    label = np.array([5, 9, 9])
+    red = np.array([0, 100, 100], np.uint8)
+    WRITERS[".npz"](big, Table(line, {}))
+    WRITERS[".npz"](small, Table(line[[0, 2, 4]], {"label": label, "red": red}))
+    return [small, big]
 
 
 def test_labels_of_several_sampled_points_vote(line_files, tmp_path):
@@ -283,7 +299,8 @@ def test_packed_colours_are_averaged_channel_by_channel(kind, tmp_path):
     done(main, [small, big, out, "--field", "rgb", "--k", 2, "--mean"])
 
     carried = np.ascontiguousarray(contents(out).columns["rgb"])
-    assert carried.view(np.uint8).reshape(-1, 4).tolist() == [
+    bytes_of_carried = carried.view(np.uint8).reshape(-1, 4)
+    assert bytes_of_carried.tolist() == [
         [0, 0, 200, 0],
         [50, 1, 100, 0],
         [100, 2, 0, 0],
@@ -308,10 +325,13 @@ def test_packed_colours_of_whole_numbers_are_carried_unmixed_without_mean(tmp_pa
 
 
 def test_double_coordinates_near_the_origin_keep_every_bit(tmp_path):
+    small = tmp_path / "small.npz"
+    big = tmp_path / "big.npy"
     points = np.random.default_rng(1).random((50, 3))
-    np.save(tmp_path / "big.npy", points)
-    WRITERS[".npz"](tmp_path / "small.npz", Table(points[:3], {"label": np.arange(3)}))
+    np.save(big, points)
+    WRITERS[".npz"](small, Table(points[:3], {"label": np.arange(3)}))
 
-    done(main, [tmp_path / "small.npz", tmp_path / "big.npy", "--field", "label"])
+    done(main, [small, big, "--field", "label"])
 
-    np.testing.assert_array_equal(contents(tmp_path / "big_propagated.ply").points, points)
+    made = contents(tmp_path / "big_propagated.ply")
+    np.testing.assert_array_equal(made.points, points)

@@ -8,10 +8,14 @@ from mops_lightning.files.column_weights import weights_of
 from tests.support.downsample import call, done
 
 SPLAT = [
-    "x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)),
-    *(f"f_rest_{i}" for i in range(45)), "opacity", *(f"scale_{i}" for i in range(3)),
+    *("x", "y", "z"),
+    *("nx", "ny", "nz"),
+    *(f"f_dc_{i}" for i in range(3)),
+    *(f"f_rest_{i}" for i in range(45)),
+    "opacity",
+    *(f"scale_{i}" for i in range(3)),
     *(f"rot_{i}" for i in range(4)),
-]  # fmt: skip
+]
 """The properties that the reference implementation of 3D Gaussian splatting writes."""
 
 
@@ -21,25 +25,40 @@ def splat(tmp_path_factory):
     path = tmp_path_factory.mktemp("splat") / "point_cloud.ply"
     rows = np.random.default_rng(0).normal(size=(400, len(SPLAT))).astype("<f4")
     rows[:, SPLAT.index("opacity")] = np.tile([-6, 6], 200)
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
-    lines += [*(f"property float {name}" for name in SPLAT), "end_header", ""]
-    path.write_bytes("\n".join(lines).encode() + rows.tobytes())
+    lines = ["ply", "format binary_little_endian 1.0", "element vertex 400"]
+    for name in SPLAT:
+        lines.append(f"property float {name}")
+    lines.append("end_header\n")
+    head = "\n".join(lines)
+    path.write_bytes(head.encode() + rows.tobytes())
     return path, rows
+
+
+def head_and_data(path):
+    head, data = path.read_bytes().split(b"end_header\n", 1)
+    return head, data
+
+
+def bytes_of_rows(rows):
+    return {row.tobytes() for row in rows}
 
 
 @pytest.mark.parametrize("method", ["fps", "poisson", "random"])
 def test_splat_is_pruned_by_opacity_with_all_properties(method, splat, tmp_path):
     path, rows = splat
-    settings = ["--method", method, "--m", 150, "--weight", "opacity"]
-    done(path, tmp_path / "small.ply", *settings)
-    content = (tmp_path / "small.ply").read_bytes()
-    header, data = content.split(b"end_header\n", 1)
-    source = path.read_bytes().split(b"end_header\n", 1)[0]
-    assert header == source.replace(b"vertex 400", b"vertex 150")
+    small = tmp_path / "small.ply"
+
+    done(path, small, "--method", method, "--m", 150, "--weight", "opacity")
+
+    source_head, _ = head_and_data(path)
+    head, data = head_and_data(small)
+    assert head == source_head.replace(b"vertex 400", b"vertex 150")
     kept = np.frombuffer(data, "<f4").reshape(150, len(SPLAT))
-    assert len(kept) == len({row.tobytes() for row in kept})
-    assert {row.tobytes() for row in kept} <= {row.tobytes() for row in rows}
-    assert (kept[:, SPLAT.index("opacity")] > 0).mean() > 0.9
+    different = bytes_of_rows(kept)
+    assert len(different) == 150
+    assert different <= bytes_of_rows(rows)
+    opacity = kept[:, SPLAT.index("opacity")]
+    assert (opacity > 0).mean() > 0.9
 
 
 def test_splat_keeps_transparent_points_where_there_is_room(splat, tmp_path):
@@ -54,46 +73,42 @@ def test_splat_keeps_transparent_points_where_there_is_room(splat, tmp_path):
 @pytest.mark.parametrize("logit", [-6.0, 0.0, 6.0])
 def test_weight_of_a_splat_is_its_opacity(logit, splat):
     path, _ = splat
-    table = read(path, 9, 0).with_columns({"opacity": np.full(400, logit, np.float32)})
+    logits = np.full(400, logit, np.float32)
+    table = read(path, 9, 0).with_columns({"opacity": logits})
 
     weight = weights_of(table, "opacity", path)
 
-    assert weight == pytest.approx(1 / (1 + np.exp(-logit)))
+    expected = 1 / (1 + np.exp(-logit))
+    assert weight == pytest.approx(expected)
 
 
 def test_completed_set_is_filled_up_by_weight(folder, tmp_path):
-    np.savez(
-        tmp_path / "a.npz",
-        # Without the weights, all matches would be the points near the origin.
-        points=(np.random.default_rng(0).normal(size=(150, 2, 3)) * [[0.01], [1]]).reshape(-1, 3),
-        score=np.arange(300) % 2,
-    )
-    settings = ["--weights", folder, "--m", 40, "--weight", "score"]
-    assert call(tmp_path / "a.npz", tmp_path / "b.npz", *settings)[0] == 0
-    assert read(tmp_path / "b.npz", 9, 0).columns["score"].tolist() == [1] * 40
+    source = tmp_path / "a.npz"
+    out = tmp_path / "b.npz"
+    # Without the weights, all matches would be the points near the origin.
+    points = np.random.default_rng(0).normal(size=(300, 3))
+    points[::2] *= 0.01
+    np.savez(source, points=points, score=np.arange(300) % 2)
+
+    status, _, _ = call(source, out, "--weights", folder, "--m", 40, "--weight", "score")
+
+    assert status == 0
+    score = read(out, 9, 0).columns["score"]
+    assert score.tolist() == [1] * 40
 
 
 def test_weight_acts_among_the_points_of_a_chunk(splat, tmp_path):
+    path, _ = splat
+    out = tmp_path / "a.ply"
     settings = ["--method", "fps", "--m", 90, "--weight", "opacity", "--chunk", 250]
-    assert call(splat[0], tmp_path / "a.ply", *settings)[0] == 0
-    table = read(tmp_path / "a.ply", 9, 0)
+
+    status, _, _ = call(path, out, *settings)
+
+    assert status == 0
+    table = read(out, 9, 0)
     assert len(table.points) == 90
-    assert (table.columns["opacity"] > 0).mean() > 0.9
-    assert call(splat[0], tmp_path / "b.ply", *settings, "--coordinates-only")[0] == 0
-    assert not read(tmp_path / "b.ply", 9, 0).columns
-
-
-def test_curvature_is_computed_unless_it_is_a_column(tmp_path):
-    plane, sphere = np.random.default_rng(0).normal(size=(2, 500, 3))
-    plane *= [3, 3, 0]
-    sphere = sphere / np.linalg.norm(sphere, axis=1, keepdims=True) * 0.3 + [0, 0, 9]
-    points, settings = np.vstack([plane, sphere]), ["--method", "random", "--m", 200]
-    np.save(tmp_path / "a.npy", points)
-    assert call(tmp_path / "a.npy", tmp_path / "b.npy", *settings, "--weight", "curvature")[0] == 0
-    assert (np.load(tmp_path / "b.npy")[:, 2] > 5).mean() > 0.6
-    np.savez(tmp_path / "a.npz", points=points, curvature=np.repeat([1, 0], 500))
-    assert call(tmp_path / "a.npz", tmp_path / "c.npy", *settings, "--weight", "curvature")[0] == 0
-    assert (np.load(tmp_path / "c.npy")[:, 2] < 5).all()
+    is_opaque = table.columns["opacity"] > 0
+    assert is_opaque.mean() > 0.9
 
 
 @pytest.mark.parametrize(
@@ -120,3 +135,52 @@ def test_weight_that_cannot_be_used_ends_in_one_line(field, arguments, said, fol
     assert status == 2
     assert said in err
     assert len(err.strip().splitlines()) == 1
+
+
+def test_weight_of_a_chunk_is_no_column_of_coordinates_alone(splat, tmp_path):
+    path, _ = splat
+    out = tmp_path / "b.ply"
+    settings = ["--method", "fps", "--m", 90, "--weight", "opacity", "--chunk", 250]
+
+    status, _, _ = call(path, out, *settings, "--coordinates-only")
+
+    assert status == 0
+    assert not read(out, 9, 0).columns
+
+
+@pytest.fixture
+def plane_and_sphere():
+    """500 points of a plane, and 500 of a small sphere above it."""
+    plane, directions = np.random.default_rng(0).normal(size=(2, 500, 3))
+    plane *= [3, 3, 0]
+    unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    sphere = unit * 0.3 + np.array([0, 0, 9])
+    return np.vstack([plane, sphere])
+
+
+BY_CURVATURE = ["--method", "random", "--m", 200, "--weight", "curvature"]
+
+
+def test_curvature_is_computed(plane_and_sphere, tmp_path):
+    source = tmp_path / "a.npy"
+    out = tmp_path / "b.npy"
+    np.save(source, plane_and_sphere)
+
+    status, _, _ = call(source, out, *BY_CURVATURE)
+
+    assert status == 0
+    of_sphere = np.load(out)[:, 2] > 5
+    assert of_sphere.mean() > 0.6
+
+
+def test_curvature_is_a_column_of_the_file_if_it_has_one(plane_and_sphere, tmp_path):
+    source = tmp_path / "a.npz"
+    out = tmp_path / "c.npy"
+    of_plane = np.repeat([1, 0], 500)
+    np.savez(source, points=plane_and_sphere, curvature=of_plane)
+
+    status, _, _ = call(source, out, *BY_CURVATURE)
+
+    assert status == 0
+    height = np.load(out)[:, 2]
+    assert (height < 5).all()

@@ -17,11 +17,14 @@ from mops_lightning.ops.stability import (
 
 def box(number, seed=0):
     """Points on the faces of a box, and some noise."""
+    half_size = np.array([3, 2, 1])
     rng = np.random.default_rng(seed)
-    points = rng.uniform(-1, 1, (number, 3)) * [3, 2, 1]
+    points = rng.uniform(-1, 1, (number, 3)) * half_size
     axis = rng.integers(3, size=number)
-    points[np.arange(number), axis] = rng.choice([-1, 1], number) * np.array([3, 2, 1])[axis]
-    return points + rng.normal(0, 0.01, points.shape)
+    side = rng.choice([-1, 1], number)
+    points[np.arange(number), axis] = side * half_size[axis]
+    noise = rng.normal(0, 0.01, points.shape)
+    return points + noise
 
 
 def plain_informative(rows, m):
@@ -29,22 +32,27 @@ def plain_informative(rows, m):
     matrix = PRIOR * np.eye(6)
     chosen: list[int] = []
     for _ in range(m):
-        gains = [np.linalg.slogdet(matrix + np.outer(v, v))[1] for v in rows]
-        gains = [-np.inf if place in chosen else gain for place, gain in enumerate(gains)]
-        chosen.append(int(np.argmax(gains)))
-        matrix += np.outer(rows[chosen[-1]], rows[chosen[-1]])
+        gains = []
+        for place, row in enumerate(rows):
+            _, gain = np.linalg.slogdet(matrix + np.outer(row, row))
+            gains.append(-np.inf if place in chosen else gain)
+        best = int(np.argmax(gains))
+        chosen.append(best)
+        matrix += np.outer(rows[best], rows[best])
     return chosen
 
 
 def plain_stable(rows, m):
     """Look through all points for every choice."""
-    directions = np.linalg.eigh(rows.T @ rows)[1]
+    _, directions = np.linalg.eigh(rows.T @ rows)
     squares = (rows @ directions) ** 2
     chosen: list[int] = []
     for _ in range(m):
-        weakest = int(np.argmin(squares[chosen].sum(0)))
-        left = [place for place in range(len(rows)) if place not in chosen]
-        chosen.append(max(left, key=lambda place: squares[place, weakest]))
+        held = squares[chosen].sum(0)
+        weakest = int(np.argmin(held))
+        gains = squares[:, weakest].copy()
+        gains[chosen] = -np.inf
+        chosen.append(int(np.argmax(gains)))
     return chosen
 
 
@@ -56,29 +64,36 @@ def plain_steady(rows, spread, m):
     chosen: list[int] = []
     for _ in range(m):
         traces = np.full(len(rows), np.inf)
-        for place in set(range(len(rows))) - set(chosen):
-            square = np.outer(rows[place], rows[place])
+        for place, row in enumerate(rows):
+            if place in chosen:
+                continue
+            square = np.outer(row, row)
             inverse = np.linalg.inv(information + square)
             covariance = inverse @ (noise + variances[place] * square) @ inverse
-            traces[place] = np.trace(covariance[:3, :3])  # of the rotation
-        chosen.append(int(np.argmin(traces)))
-        square = np.outer(rows[chosen[-1]], rows[chosen[-1]])
+            rotation = covariance[:3, :3]
+            traces[place] = np.trace(rotation)
+        best = int(np.argmin(traces))
+        chosen.append(best)
+        square = np.outer(rows[best], rows[best])
         information += square
-        noise += variances[chosen[-1]] * square
+        noise += variances[best] * square
     return chosen
 
 
 def test_rows_are_the_changes_of_plane_distances_under_small_motions():
-    rng = np.random.default_rng(0)
-    points = rng.normal(size=(20, 3))
+    points = np.random.default_rng(0).normal(size=(20, 3))
     normals = estimate_normals(points)
-    scale = np.linalg.norm(points - points.mean(0), axis=1).mean()
-    turn, shift = np.array([1e-6, -2e-6, 3e-6]), np.array([2e-6, 1e-6, -1e-6])
-    moved = points + np.cross(turn, points - points.mean(0)) + shift
+    from_centre = points - points.mean(0)
+    scale = np.linalg.norm(from_centre, axis=1).mean()
+    turn = np.array([1e-6, -2e-6, 3e-6])
+    shift = np.array([2e-6, 1e-6, -1e-6])
+    motion = np.concatenate([turn * scale, shift])
 
-    change = plane_rows(points, normals) @ np.concatenate([turn * scale, shift])
+    change = plane_rows(points, normals) @ motion
 
-    assert change == pytest.approx(np.einsum("ni,ni->n", moved - points, normals), rel=1e-6)
+    displacement = np.cross(turn, from_centre) + shift
+    along_normals = (displacement * normals).sum(1)
+    assert change == pytest.approx(along_normals, rel=1e-6)
 
 
 def test_informative_places_equal_a_search_of_all_log_determinants():
@@ -124,30 +139,43 @@ def test_all_rules_return_every_place_once_when_all_points_are_kept():
         assert sorted(places) == list(range(60))
 
 
-def test_informative_and_stable_points_keep_the_step_that_holds_a_plane():
+@pytest.mark.parametrize("places_of", [informative_places, stable_places])
+def test_informative_and_stable_points_keep_the_step_that_holds_a_plane(places_of):
     """A floor slides in x and y and turns about z; only the points of a few steps prevent it."""
     rng = np.random.default_rng(0)
-    floor = np.column_stack([rng.uniform(-5, 5, (1000, 2)), np.zeros(1000)])
-    wall = np.column_stack([np.full(15, 1.0), rng.uniform(-1, 1, 15), rng.uniform(0, 1, 15)])
+    floor = np.zeros((1000, 3))
+    floor[:, :2] = rng.uniform(-5, 5, (1000, 2))
+    wall = np.ones((15, 3))
+    wall[:, 1] = rng.uniform(-1, 1, 15)
+    wall[:, 2] = rng.uniform(0, 1, 15)
     points = np.concatenate([floor, wall])
     normals = np.repeat([[0.0, 0, 1], [1.0, 0, 0]], [1000, 15], axis=0)
     rows = plane_rows(points, normals)
 
-    for places in (informative_places(rows, 16), stable_places(rows, 16)):
-        assert (places >= 1000).sum() >= 4
+    places = places_of(rows, 16)
+
+    of_wall = places >= 1000
+    assert of_wall.sum() >= 4
 
 
 def test_directions_give_points_in_turn_and_opposite_normals_are_one_direction():
-    up, side = [0.0, 0, 1], [1.0, 0, 0]
-    down, tilted = [0.0, 0, -1], [0.6, 0, 0.8]
+    up = [0.0, 0.0, 1.0]
+    down = [0.0, 0.0, -1.0]
+    side = [1.0, 0.0, 0.0]
+    tilted = [0.6, 0.0, 0.8]
     normals = np.array([up, down, up, side, up, tilted, side])
 
-    assert places_by_direction(normals, 7).tolist() == [0, 3, 5, 1, 6, 2, 4]
+    places = places_by_direction(normals, 7)
+
+    assert places.tolist() == [0, 3, 5, 1, 6, 2, 4]
 
 
 def test_directions_near_an_axis_share_a_cell_whatever_their_sign():
     rng = np.random.default_rng(0)
-    normals = np.array([0.0, 0, 1]) + rng.uniform(-0.1, 0.1, (50, 3))
+    normals = rng.uniform(-0.1, 0.1, (50, 3))
+    normals[:, 2] += 1.0
     normals *= rng.choice([-1, 1], (50, 1))
 
-    assert places_by_direction(normals, 50).tolist() == list(range(50))
+    places = places_by_direction(normals, 50)
+
+    assert places.tolist() == list(range(50))

@@ -1,5 +1,6 @@
 """The compiled loops, a plain form in torch, and the formula as published; the sampler."""
 
+from functools import partial
 import pytest
 import torch
 
@@ -29,6 +30,20 @@ def crowding(cloud, row, kept, reach):
     return total
 
 
+def eliminated_in_steps(cloud, m, share, weights_to):
+    """Return the rows that are left of a cloud; ``weights_to`` gives the crowding by a row."""
+    sums = weights_to(cloud[:, None]).sum(1)
+    for _ in range(len(cloud) - m):
+        compared = sums
+        if share is not None:
+            compared = (sums * share).long()
+        worst = compared.argmax()
+        sums -= weights_to(cloud[worst])
+        sums[worst] = -1
+    (kept,) = torch.where(sums > 0)
+    return kept
+
+
 def in_steps(points, m, weight=None):
     """Sample elimination with whole weights and the distances to all points in a step."""
     points = points.double()
@@ -36,26 +51,20 @@ def in_steps(points, m, weight=None):
     reach = spacing_bound(points, m).clamp_min(torch.finfo(torch.float64).tiny)
     scale = 2.0 ** min(50, 62 - number.bit_length())
 
-    def weights(cloud, others, bound):
-        axes = range(others.shape[-1])
-        squared = sum((cloud[..., axis] - others[..., axis]) ** 2 for axis in axes)
+    def weights(cloud, bound, others):
+        squared = 0
+        for axis in range(others.shape[-1]):
+            difference = cloud[..., axis] - others[..., axis]
+            squared = squared + difference**2
         shares = squared.sqrt() * bound.reciprocal()
-        return ((1 - shares).clamp_min(0).square().square().square() * scale).long()
+        eighth_power = (1 - shares).clamp_min(0).square().square().square()
+        return (eighth_power * scale).long()
 
     kept = []
-    shares = torch.ones(points.shape[:2])
-    if weight is not None:
-        shares = weight.amin() / weight
-    for cloud, bound, share in zip(points, reach, shares, strict=True):
-        sums = weights(cloud, cloud[:, None], bound).sum(1)
-        for _ in range(number - m):
-            compared = sums
-            if weight is not None:
-                compared = (sums * share).long()
-            worst = compared.argmax()
-            sums -= weights(cloud, cloud[worst], bound)
-            sums[worst] = -1
-        kept.append((sums > 0).nonzero()[:, 0])
+    for row, (cloud, bound) in enumerate(zip(points, reach, strict=True)):
+        share = None if weight is None else weight[row].amin() / weight[row]
+        weights_to = partial(weights, cloud, bound)
+        kept.append(eliminated_in_steps(cloud, m, share, weights_to))
     return torch.stack(kept)
 
 
@@ -64,18 +73,21 @@ def test_eliminate_equals_published_formula(m, rng):
     points = torch.randn(3, 24, 3, generator=rng, dtype=torch.float64)
     reach = spacing_bound(points, m)
 
-    kept = eliminate(points, m).tolist()
+    kept = eliminate(points, m)
 
-    assert kept[0] == published(points[0], m, float(reach[0]))
-    assert kept[1] == published(points[1], m, float(reach[1]))
-    assert kept[2] == published(points[2], m, float(reach[2]))
+    for row, cloud in enumerate(points):
+        expected = published(cloud, m, float(reach[row]))
+        assert kept[row].tolist() == expected
 
 
 def test_eliminate_to_one_point_has_reach_of_bounding_box(rng):
-    points = torch.randn(1, 24, 3, generator=rng, dtype=torch.float64)
-    reach = float((points[0].amax(0) - points[0].amin(0)).norm())
+    cloud = torch.randn(24, 3, generator=rng, dtype=torch.float64)
+    diagonal = cloud.amax(0) - cloud.amin(0)
 
-    assert eliminate(points, 1).tolist() == [published(points[0], 1, reach)]
+    kept = eliminate(cloud[None], 1)
+
+    expected = published(cloud, 1, float(diagonal.norm()))
+    assert kept.tolist() == [expected]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -83,7 +95,9 @@ def test_eliminate_to_one_point_has_reach_of_bounding_box(rng):
 def test_eliminate_equals_plain_form(n, m, kind, rng):
     points = cloud_of(kind, (2, n), torch.float32, rng)
 
-    assert torch.equal(eliminate(points, m), in_steps(points, m))
+    kept = eliminate(points, m)
+
+    assert torch.equal(kept, in_steps(points, m))
 
 
 @pytest.mark.parametrize("channels", [1, 2, 5])
@@ -104,15 +118,8 @@ def test_eliminate_divides_crowding_by_weight(n, m, kind, rng):
 
     assert torch.equal(kept, in_steps(points, m, weight))
     if kind == "sphere" and m == 150:
-        assert weight.gather(1, kept).mean() > 1.2 * weight.mean()
-
-
-def test_eliminate_of_points_not_contiguous_or_with_gradients_equals_plain_form(rng):
-    points = torch.rand(3, 400, 2, generator=rng, dtype=torch.float64).transpose(0, 2)[:, ::2]
-
-    assert torch.equal(eliminate(points, 30), in_steps(points, 30))
-    chosen = PoissonSampler(30)(points.clone().requires_grad_()).indices
-    assert torch.equal(chosen, PoissonSampler(30)(points).indices)
+        weight_of_kept = weight.gather(1, kept)
+        assert weight_of_kept.mean() > 1.2 * weight.mean()
 
 
 def test_eliminate_of_many_copies_removes_the_lowest_row_of_them():
@@ -125,6 +132,25 @@ def test_eliminate_of_many_copies_removes_the_lowest_row_of_them():
     assert kept[0].tolist() == [0, *range(2, 8200)]
 
 
+def test_eliminate_of_points_not_contiguous_equals_plain_form(rng):
+    points = torch.rand(3, 400, 2, generator=rng, dtype=torch.float64)
+    not_contiguous = points.transpose(0, 2)[:, ::2]
+
+    kept = eliminate(not_contiguous, 30)
+
+    assert torch.equal(kept, in_steps(not_contiguous, 30))
+
+
+def test_poisson_of_points_with_gradients_keeps_the_same_points(rng):
+    points = torch.rand(2, 200, 3, generator=rng, dtype=torch.float64)
+    with_gradients = points.clone().requires_grad_()
+    sampler = PoissonSampler(30)
+
+    kept = sampler(with_gradients).indices
+
+    assert torch.equal(kept, sampler(points).indices)
+
+
 @pytest.mark.parametrize("m", [2, 5, 12])
 def test_spacing_bound_is_upper_bound(m, rng):
     points = torch.randn(20, 30, 3, generator=rng, dtype=torch.float64)
@@ -133,21 +159,24 @@ def test_spacing_bound_is_upper_bound(m, rng):
 
     for _ in range(30):
         rows = torch.randperm(30, generator=rng)[:m]
-        spacing = torch.cdist(points[:, rows], points[:, rows])
-        spacing.diagonal(dim1=1, dim2=2).fill_(torch.inf)
-        assert (spacing.amin((1, 2)) <= bound[:, 0]).all()
+        spacing_of_sample = spacing(points[:, rows])
+        assert (spacing_of_sample <= bound[:, 0]).all()
 
 
 def spacing(points):
+    """Return the smallest distance between two points of each cloud."""
     distances = torch.cdist(points, points)
     distances.diagonal(dim1=1, dim2=2).fill_(torch.inf)
-    return distances.amin((1, 2)).mean()
+    return distances.amin((1, 2))
 
 
 def test_poisson_is_more_even_than_random(rng):
     flat = torch.rand(8, 600, 3, generator=rng) * torch.tensor([1.0, 1.0, 0.0])
 
-    even = spacing(PoissonSampler(60)(flat).points)
+    poisson = PoissonSampler(60)(flat)
+    random = RandomSampler(60)(flat)
+    fps = FPSSampler(60)(flat)
 
-    assert even > 4 * spacing(RandomSampler(60)(flat).points)
-    assert even > 0.8 * spacing(FPSSampler(60)(flat).points)
+    even = spacing(poisson.points).mean()
+    assert even > 4 * spacing(random.points).mean()
+    assert even > 0.8 * spacing(fps.points).mean()

@@ -1,3 +1,4 @@
+from mops_lightning.ops.points import gather_points
 import math
 
 import pytest
@@ -8,61 +9,77 @@ from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet, s
 from tests.support.losses import simplification_loss
 
 
+def plain_projected(query, cloud, k, sigma):
+    """Project one point on its k nearest, differentiably."""
+    squares = (query - cloud).square().sum(1)
+    near = squares.detach().argsort()[:k]
+    weights = torch.exp(-squares[near] / sigma)
+    weighted = weights[:, None] * cloud[near]
+    return weighted.sum(0) / weights.sum()
+
+
 def plain_projection(queries, points, k, sigma):
     """Project every point in a double loop, differentiably."""
-    projected = []
+    clouds = []
     for query_cloud, cloud in zip(queries, points, strict=True):
-        rows = []
-        for q in query_cloud:
-            near = sorted(cloud, key=lambda p: float((q - p).detach().square().sum()))[:k]
-            weights = [torch.exp(-(q - p).square().sum() / sigma) for p in near]
-            rows.append(sum(w * p for w, p in zip(weights, near, strict=True)) / sum(weights))
-        projected.append(torch.stack(rows))
-    return torch.stack(projected)
+        projected = [plain_projected(query, cloud, k, sigma) for query in query_cloud]
+        clouds.append(torch.stack(projected))
+    return torch.stack(clouds)
 
 
 @pytest.mark.parametrize("k", [1, 4, 11])
 def test_soft_projection_equals_double_loop(k, rng):
-    points = torch.randn(2, 11, 3, generator=rng, dtype=torch.float64)
-    queries = torch.randn(2, 5, 3, generator=rng, dtype=torch.float64)
-    inputs = [queries, points, torch.tensor(0.7, dtype=torch.float64)]
-    inputs = [x.requires_grad_() for x in inputs]
-    weights = torch.randn(2, 5, 3, generator=rng, dtype=torch.float64)
-    fast = soft_projection(inputs[0], inputs[1], k, inputs[2])
-    plain = plain_projection(inputs[0], inputs[1], k, inputs[2])
+    points = torch.randn(2, 11, 3, generator=rng, dtype=torch.float64).requires_grad_()
+    queries = torch.randn(2, 5, 3, generator=rng, dtype=torch.float64).requires_grad_()
+    sigma = torch.tensor(0.7, dtype=torch.float64, requires_grad=True)
+    direction = torch.randn(2, 5, 3, generator=rng, dtype=torch.float64)
+
+    fast = soft_projection(queries, points, k, sigma)
+
+    plain = plain_projection(queries, points, k, sigma)
     torch.testing.assert_close(fast, plain)
     if k == 1:
         return  # the weight is 1 for any query and sigma
-    got = torch.autograd.grad((fast * weights).sum(), inputs)
-    want = torch.autograd.grad((plain * weights).sum(), inputs)
-    for one, other in zip(got, want, strict=True):
-        torch.testing.assert_close(one, other)
+    inputs = [queries, points, sigma]
+    gradients = torch.autograd.grad((fast * direction).sum(), inputs)
+    expected = torch.autograd.grad((plain * direction).sum(), inputs)
+    torch.testing.assert_close(gradients, expected)
 
 
 def test_soft_projection_limits_are_nearest_point_and_mean(rng):
     points = torch.randn(3, 50, 3, generator=rng)
     queries = torch.randn(3, 9, 3, generator=rng)
-    index = nearest(queries, points)[1]
-    closest = points.gather(1, index[..., None].expand(-1, -1, 3))
-    torch.testing.assert_close(soft_projection(queries, points, 7, 1e-9), closest)
-    assert torch.isfinite(soft_projection(queries, points, 7, torch.tensor(1e-38))).all()
-    rows = k_nearest(queries, points, 7)[1].flatten(1)
-    neighbours = points.gather(1, rows[..., None].expand(-1, -1, 3)).unflatten(1, (9, 7))
-    torch.testing.assert_close(soft_projection(queries, points, 7, 1e9), neighbours.mean(2))
+    _, nearest_rows = nearest(queries, points)
+    _, near_rows = k_nearest(queries, points, 7)
+
+    sharp = soft_projection(queries, points, 7, 1e-9)
+    sharpest = soft_projection(queries, points, 7, torch.tensor(1e-38))
+    wide = soft_projection(queries, points, 7, 1e9)
+
+    torch.testing.assert_close(sharp, gather_points(points, nearest_rows))
+    assert torch.isfinite(sharpest).all()
+    neighbours = gather_points(points, near_rows)
+    torch.testing.assert_close(wide, neighbours.mean(2))
 
 
 def test_samplenet_projects_in_training_only(rng):
     net = SampleNet(6, k=4, beta=0.5, alpha=3.0).train()
     points = torch.randn(4, 20, 3, generator=rng)
-    assert net(points).losses["projection"] == 0.5  # sigma starts at 1²
+    at_start = net(points)
     torch.nn.init.constant_(net.temperature, 0.6)
-    output = net(points)
-    projected = soft_projection(output.points, points, 4, 0.6**2)
-    torch.testing.assert_close(output.soft_projected, projected)
-    torch.testing.assert_close(output.losses["projection"], torch.tensor(0.5 * 0.6**2))
-    expected = 3 * simplification_loss(points, output.points)
-    torch.testing.assert_close(output.losses["simplification"], expected)
-    assert net.eval()(points).soft_projected is None
+
+    in_training = net(points)
+    in_test = net.eval()(points)
+
+    assert at_start.losses["projection"] == 0.5  # sigma starts at 1²
+    generated = in_training.points
+    projected = soft_projection(generated, points, 4, 0.6**2)
+    torch.testing.assert_close(in_training.soft_projected, projected)
+    projection_loss = torch.tensor(0.5 * 0.6**2)
+    torch.testing.assert_close(in_training.losses["projection"], projection_loss)
+    expected = 3 * simplification_loss(points, generated)
+    torch.testing.assert_close(in_training.losses["simplification"], expected)
+    assert in_test.soft_projected is None
 
 
 def test_samplenet_projection_in_evaluation_equals_double_loop_with_learned_temperature(rng):
@@ -106,20 +123,26 @@ def test_progressive_samples_are_nested(rng):
     points = torch.randn(4, 40, 3, generator=rng)
     net(points)  # running statistics change with every call, the result does not
     whole = net(points).points
+
     outputs = net.sample_sizes(points, net.training_sizes())
+
     assert list(outputs) == [2, 4, 8, 16]
     for m, output in outputs.items():
-        assert torch.equal(output.points, whole[:, :m])
-        expected = 30 * simplification_loss(points, whole[:, :m], 0.5, 1 / 30)
+        first = whole[:, :m]
+        assert torch.equal(output.points, first)
+        expected = 30 * simplification_loss(points, first, 0.5, 1 / 30)
         torch.testing.assert_close(output.losses["simplification"], expected)
 
 
 @pytest.mark.parametrize("reduction", ["sum", "mean"])
 def test_progressive_samplenet_adds_projection_once(reduction, rng):
     net = ProgressiveSampleNet(16, k=3, beta=0.5, size_reduction=reduction).train()
+    points = torch.randn(4, 30, 3, generator=rng)
     sizes = net.training_sizes()
-    outputs = net.sample_sizes(torch.randn(4, 30, 3, generator=rng), sizes)
-    terms = torch.stack([outputs[m].losses["projection"] for m in sizes])
-    total = terms.sum() if reduction == "sum" else terms.mean()
+
+    outputs = net.sample_sizes(points, sizes)
+
     assert len(sizes) == 4
+    losses = torch.stack([outputs[m].losses["projection"] for m in sizes])
+    total = losses.sum() if reduction == "sum" else losses.mean()
     torch.testing.assert_close(total, torch.tensor(0.5))  # sigma starts at 1

@@ -1,5 +1,6 @@
 """Tiles: cut, sampled, and thinned where they meet."""
 
+import math
 from itertools import pairwise
 from typing import Any
 
@@ -16,14 +17,17 @@ from mops_lightning.samplers.tiles import balanced_tiles, sample_by_tiles, share
 
 
 def cloud(number, seed=0):
-    return np.random.default_rng(seed).normal(size=(number, 3)) * [5, 2, 1] + [400_000, 0, 0]
+    unit = np.random.default_rng(seed).normal(size=(number, 3))
+    return unit * [5, 2, 1] + np.array([400_000, 0, 0])
 
 
 def street(number=4000):
     """A flat strip far from the origin, denser at one end."""
     random = np.random.default_rng(0)
     along = 40 * random.random(number) ** 2
-    points = np.stack([along, 4 * random.random(number), 0.1 * random.random(number)], 1)
+    across = 4 * random.random(number)
+    height = 0.1 * random.random(number)
+    points = np.column_stack([along, across, height])
     return points + np.array([431_000, 5_412_000, 120])
 
 
@@ -33,48 +37,89 @@ def sampler():
     return FMOPSNet(64).eval()
 
 
-@pytest.mark.parametrize(("number", "size"), [(1000, 128), (1025, 128), (100, 128), (7, 2), (1, 2)])
+@pytest.mark.parametrize(
+    ("number", "size"),
+    [
+        (1000, 128),
+        (1025, 128),
+        (100, 128),
+        (7, 2),
+        (1, 2),
+    ],
+)
 def test_balanced_tiles_partition_into_equal_parts(number, size):
     tiles = balanced_tiles(cloud(number), size)
-    assert sorted(np.concatenate(tiles).tolist()) == list(range(number))
+
+    rows = np.concatenate(tiles)
+    assert sorted(rows.tolist()) == list(range(number))
     sizes = [len(tile) for tile in tiles]
     assert max(sizes) <= size
     assert max(sizes) - min(sizes) <= 1
-    assert len(tiles) == -(-number // size)
+    assert len(tiles) == math.ceil(number / size)
 
 
-def test_balanced_tiles_do_not_overlap_and_cut_equal_points():
+def test_balanced_tiles_do_not_overlap():
     points = np.random.default_rng(0).uniform(size=(512, 3)) * [8, 1, 1]
-    ends = sorted(
-        (points[tile, 0].min(), points[tile, 0].max()) for tile in balanced_tiles(points, 64)
-    )
-    assert all(first[1] <= second[0] for first, second in pairwise(ends))
-    assert sorted(map(len, balanced_tiles(np.ones((10, 3)), 4))) == [3, 3, 4]
+
+    tiles = balanced_tiles(points, 64)
+
+    ends = []
+    for tile in tiles:
+        along = points[tile, 0]
+        ends.append((along.min(), along.max()))
+    for (_, end), (start, _) in pairwise(sorted(ends)):
+        assert end <= start
+
+
+def test_balanced_tiles_cut_equal_points():
+    points = np.ones((10, 3))
+
+    tiles = balanced_tiles(points, 4)
+
+    assert sorted(map(len, tiles)) == [3, 3, 4]
 
 
 def test_shares_sum_to_m_in_proportion():
-    sizes = np.random.default_rng(1).integers(1, 40, 50).tolist()
-    numbers = shares(333, sizes)
+    sizes = np.random.default_rng(1).integers(1, 40, 50)
+    total = int(sizes.sum())
+
+    numbers = shares(333, sizes.tolist())
+    all_numbers = shares(total, sizes.tolist())
+
+    exact = sizes * 333 / total
     assert numbers.sum() == 333
-    assert np.abs(numbers - np.array(sizes) * 333 / sum(sizes)).max() < 1
-    assert shares(sum(sizes), sizes).tolist() == sizes
+    assert np.abs(numbers - exact).max() < 1
+    assert all_numbers.tolist() == sizes.tolist()
 
 
-def test_thin_removes_one_of_the_nearest_two():
-    points = np.array([0, 1, 2, 2.1, 3, 4, 4.2, 5])[:, None] * [1.0, 0, 0]
-    assert thin(points, 8).tolist() == list(range(8))
-    assert thin(points, 7).tolist() == [0, 1, 2, 4, 5, 6, 7]
-    assert thin(points, 6).tolist() == [0, 1, 2, 4, 5, 7]
+@pytest.mark.parametrize(
+    ("m", "rows"),
+    [
+        (8, [0, 1, 2, 3, 4, 5, 6, 7]),
+        (7, [0, 1, 2, 4, 5, 6, 7]),
+        (6, [0, 1, 2, 4, 5, 7]),
+    ],
+)
+def test_thin_removes_one_of_the_nearest_two(m, rows):
+    points = np.zeros((8, 3))
+    points[:, 0] = [0, 1, 2, 2.1, 3, 4, 4.2, 5]
+
+    assert thin(points, m).tolist() == rows
 
 
 def test_thin_equals_plain_removal():
     points = cloud(200)
-    remains = list(range(200))
+    left = list(range(200))
     for _ in range(50):
-        distance = np.linalg.norm(points[remains][:, None] - points[remains], axis=2)
-        distance[np.tril_indices(len(remains))] = np.inf
-        remains.pop(int(np.unravel_index(distance.argmin(), distance.shape)[1]))
-    assert thin(points, 150).tolist() == remains
+        points_left = points[left]
+        distances = np.linalg.norm(points_left[:, None] - points_left, axis=2)
+        distances[np.tril_indices(len(left))] = np.inf
+        _, second = np.unravel_index(distances.argmin(), distances.shape)
+        left.pop(int(second))
+
+    rows = thin(points, 150)
+
+    assert rows.tolist() == left
 
 
 def test_thin_equal_points_leaves_m():
@@ -110,12 +155,18 @@ def test_sample_by_tiles_samples_every_tile_as_the_sampler_does(sampler):
     for one in (sampler, FPSSampler(64)):
         expected: set[int] = set()
         for tile in balanced_tiles(points, 256):
-            centred = points[tile] - points[tile].mean(0)
-            sphere = torch.from_numpy(centred / np.linalg.norm(centred, axis=1).max()).float()
-            given = torch.from_numpy(points[tile]) if one.any_unit else sphere
-            rows: Any = one.select("completed", given[None], 40)[1]
-            expected.update(tile[rows[0].numpy()])
-        assert expected.issuperset(sample_by_tiles(points, 256, 64, one))
+            given = points[tile]
+            if not one.any_unit:
+                centred = given - given.mean(0)
+                radius = np.linalg.norm(centred, axis=1).max()
+                given = (centred / radius).astype(np.float32)
+            selected: Any = one.select("completed", torch.from_numpy(given)[None], 40)
+            _, (rows,) = selected
+            expected.update(tile[rows.numpy()])
+
+        sampled = sample_by_tiles(points, 256, 64, one)
+
+        assert expected.issuperset(sampled)
 
 
 def test_sample_by_tiles_all_points_and_too_many(sampler):

@@ -30,14 +30,17 @@ def test_points_outside_of_the_headers_bounds_are_read_on_every_path(name, tmp_p
     cloud = full_cloud(6)
     cloud.write(path)
     patched(path, "<6d", BOUNDS, 1, 0, 1, 0, 1, 0)
-    area = Area((5e5 - 100, 5.4e6 - 100, -9), (5e5 + 100, 5.4e6 + 100, 9))
+    low = (5e5 - 100, 5.4e6 - 100, -9)
+    high = (5e5 + 100, 5.4e6 + 100, 9)
 
+    whole = read(path, 1, 0)
     file = open_cloud_file(path)
     parts = [file.read(rows).points for rows in file.row_ranges(70)]
+    in_area = read(path, 1, 0, Area(low, high))
 
-    np.testing.assert_array_equal(read(path, 1, 0).points, cloud.xyz)
+    np.testing.assert_array_equal(whole.points, cloud.xyz)
     np.testing.assert_array_equal(np.concatenate(parts), cloud.xyz)
-    assert len(read(path, 1, 0, area).points) == 300
+    assert len(in_area.points) == 300
 
 
 def as_version_15(path):
@@ -54,13 +57,16 @@ def as_version_15(path):
 
 
 def test_las_15_keeps_points_and_header_with_its_times(tmp_path):
-    path, out = tmp_path / "a.las", tmp_path / "out.las"
+    path = tmp_path / "a.las"
+    out = tmp_path / "out.las"
     full_cloud(8).write(path)
     as_version_15(path)
+    table = read(path, 1, 0)
 
-    write(out, read(path, 1, 0).take(np.arange(7, 40)))
+    write(out, table.take(np.arange(7, 40)))
 
-    cloud, again = laspy.read(path), laspy.read(out)
+    cloud = laspy.read(path)
+    again = laspy.read(out)
     np.testing.assert_array_equal(again.points.array, cloud.points.array[7:40])
     assert header_fields(out) == header_fields(path)
     assert again.header.gps_time_offset == 1234
@@ -107,26 +113,31 @@ def test_waveforms_inside_of_the_file_are_refused_unless_left_out(tmp_path):
     assert not again.header.start_of_waveform_data_packet_record
 
 
+def bytes_by_point(cloud):
+    return cloud.points.array.view(np.uint8).reshape(len(cloud.points), -1)
+
+
 def test_undocumented_bytes_stay_and_are_documented_beside_a_new_dimension(tmp_path):
     path = tmp_path / "a.las"
+    same = tmp_path / "b.las"
+    longer = tmp_path / "c.las"
+    label = np.arange(300)
     cloud = full_cloud(1)
     cloud.write(path)
     content = path.read_bytes()
-    path.write_bytes(content.replace(struct.pack("<16sH", b"LASF_Spec", 4), bytes(18)))
+    documentation = struct.pack("<16sH", b"LASF_Spec", 4)
+    path.write_bytes(content.replace(documentation, bytes(18)))
     table = read(path, 1, 0)
 
-    write(tmp_path / "b.las", table)
-    write(tmp_path / "c.las", table.with_columns({"label": np.arange(300)}))
+    write(same, table)
+    write(longer, table.with_columns({"label": label}))
 
     size = cloud.points.array.dtype.itemsize
-    data = [(tmp_path / f"{name}.las").read_bytes()[-300 * size :] for name in "ab"]
-    assert data[0] == data[1]
-    again = laspy.read(tmp_path / "c.las")
-    np.testing.assert_array_equal(again["label"], np.arange(300))
-    rows = again.points.array.view(np.uint8).reshape(300, -1)
-    np.testing.assert_array_equal(
-        rows[:, :size], cloud.points.array.view(np.uint8).reshape(300, -1)
-    )
+    length = 300 * size
+    assert same.read_bytes()[-length:] == path.read_bytes()[-length:]
+    again = laspy.read(longer)
+    np.testing.assert_array_equal(again["label"], label)
+    np.testing.assert_array_equal(bytes_by_point(again)[:, :size], bytes_by_point(cloud))
 
 
 @pytest.mark.parametrize("form", [0, 1, 2, 3, 6, 7, 8])
@@ -154,18 +165,22 @@ def test_laz_of_laszip_is_read_exactly(form, tmp_path):
 
 @pytest.mark.parametrize("form", [6, 7, 8])
 def test_written_laz_is_read_by_copclib(form, tmp_path):
+    source = tmp_path / "a.las"
+    out = tmp_path / "out.laz"
     cloud = full_cloud(form)
-    cloud.write(tmp_path / "a.las")
+    cloud.write(source)
 
-    write(tmp_path / "out.laz", read(tmp_path / "a.las", 1, 0))
+    write(out, read(source, 1, 0))
 
-    points = copclib.LazReader(str(tmp_path / "out.laz")).GetPoints()
-    found = [(p.x, p.y, p.z, p.gps_time, p.classification, p.return_number) for p in points]
-    columns = [*cloud.xyz.T, cloud.gps_time, cloud.classification, cloud.return_number]
-    assert found == list(zip(*(np.asarray(c).tolist() for c in columns), strict=True))
-    extra = cloud.points.array.dtype.itemsize - laspy.PointFormat(form).size
-    raw = cloud.points.array.view(np.uint8).reshape(300, -1)[:, -extra:]
-    assert [bytes(p.extra_bytes) for p in points] == [row.tobytes() for row in raw]
+    points = copclib.LazReader(str(out)).GetPoints()
+    coordinates = np.array([(p.x, p.y, p.z) for p in points])
+    np.testing.assert_array_equal(coordinates, cloud.xyz)
+    assert [p.gps_time for p in points] == list(cloud.gps_time)
+    assert [p.classification for p in points] == list(cloud.classification)
+    assert [p.return_number for p in points] == list(cloud.return_number)
+    standard = laspy.PointFormat(form).size
+    for point, expected in zip(points, bytes_by_point(cloud), strict=True):
+        assert bytes(point.extra_bytes) == expected[standard:].tobytes()
 
 
 def test_columns_of_other_formats_become_dimensions(tmp_path):
@@ -199,42 +214,66 @@ EACH = NO_DATA | SMALLEST | LARGEST
 """Bits of an extra dimension's options."""
 
 
+def entry_of(content, name):
+    """Return where the description of an extra dimension begins."""
+    return content.index(name.encode().ljust(32, b"\0")) - 4
+
+
 def with_range(path, name, kind, options, *numbers):
     """Document no_data, the smallest and the largest number of an extra dimension."""
     content = bytearray(path.read_bytes())
-    entry = content.index(name.encode().ljust(32, b"\0")) - 4
-    content[entry + 3] = content[entry + 3] & ~7 | options
-    for place, number in zip((40, 64, 88), numbers, strict=True):
+    entry = entry_of(content, name)
+    other_options = content[entry + 3] & ~7
+    content[entry + 3] = other_options | options
+    for place, number in zip(RANGE_PLACES, numbers, strict=True):
         struct.pack_into(kind, content, entry + place, *number)
     path.write_bytes(content)
 
 
+RANGE_PLACES = (40, 64, 88)
+"""Of no_data, the smallest and the largest number, from the start of a description."""
+
+
 def range_of(path, name, kind):
     content = path.read_bytes()
-    entry = content.index(name.encode().ljust(32, b"\0")) - 4
-    return [struct.unpack_from(kind, content, entry + place) for place in (40, 64, 88)]
+    entry = entry_of(content, name)
+    return [struct.unpack_from(kind, content, entry + place) for place in RANGE_PLACES]
 
 
 @pytest.mark.parametrize("name", ["out.las", "out.laz", "out.copc.laz"])
 def test_ranges_of_extra_dimensions_are_those_of_the_points_that_are_kept(name, tmp_path):
-    path, out = tmp_path / "a.las", tmp_path / name
+    path = tmp_path / "a.las"
+    out = tmp_path / name
+    height = "height above ground"
+    limits = SMALLEST | LARGEST
     cloud = full_cloud(6)
     cloud["Amplitude"].array[:] = np.arange(300)
     cloud["Colors"][:] = np.arange(900).reshape(300, 3) % 256
-    cloud["height above ground"][:] = np.arange(300) - 10
-    cloud["height above ground"][50] = np.nan
+    cloud[height][:] = np.arange(300) - 10
+    cloud[height][50] = np.nan
     cloud.write(path)
     with_range(path, "Amplitude", "<Q", EACH, (50,), (0,), (299,))
-    with_range(path, "Colors", "<3Q", SMALLEST | LARGEST, (0, 0, 0), (0, 0, 0), (255, 255, 255))
-    with_range(path, "height above ground", "<d", SMALLEST | LARGEST, (0,), (-10,), (289,))
+    with_range(path, "Colors", "<3Q", limits, (0, 0, 0), (0, 0, 0), (255, 255, 255))
+    with_range(path, height, "<d", limits, (0,), (-10,), (289,))
     with_range(path, "long steps", "<q", 0, (0,), (7,), (8,))
+    table = read(path, 1, 0)
 
-    write(out, read(path, 1, 0).take(np.arange(50, 60)))
+    write(out, table.take(np.arange(50, 60)))
 
-    assert range_of(out, "Amplitude", "<Q") == [(50,), (51,), (59,)]
-    assert range_of(out, "Colors", "<3Q") == [(0, 0, 0), (150, 151, 152), (177, 178, 179)]
-    assert range_of(out, "height above ground", "<d") == [(0,), (41,), (49,)]
-    assert range_of(out, "long steps", "<q") == [(0,), (7,), (8,)]
+    no_data, smallest, largest = range_of(out, "Amplitude", "<Q")
+    assert no_data == (50,)
+    assert smallest == (51,)
+    assert largest == (59,)
+    no_data, smallest, largest = range_of(out, "Colors", "<3Q")
+    assert no_data == (0, 0, 0)
+    assert smallest == (150, 151, 152)
+    assert largest == (177, 178, 179)
+    no_data, smallest, largest = range_of(out, height, "<d")
+    assert no_data == (0,)
+    assert smallest == (41,)
+    assert largest == (49,)
+    not_documented = range_of(out, "long steps", "<q")
+    assert not_documented == [(0,), (7,), (8,)]
 
 
 @pytest.mark.parametrize("form", [4, 10])
@@ -255,21 +294,32 @@ def test_waveforms_that_stay_beside_the_input_are_said(form, tmp_path, capsys):
 
 @pytest.mark.parametrize("name", ["out.las", "out.copc.laz"])
 def test_another_grid_of_coordinates_is_said_with_the_largest_change(name, tmp_path, capsys):
-    points = np.array([[0, 0, 0], [2**30, 0.25, 0.5], [7, 1, 0.75]])
-    np.save(tmp_path / "a.npy", points)
+    source = tmp_path / "a.npy"
+    out = tmp_path / name
+    points = np.array(
+        [
+            [0, 0, 0],
+            [2**30, 0.25, 0.5],
+            [7, 1, 0.75],
+        ]
+    )
+    np.save(source, points)
 
-    write(tmp_path / name, read(tmp_path / "a.npy", 1, 0))
+    write(out, read(source, 1, 0))
 
-    np.testing.assert_array_equal(laspy.read(tmp_path / name).xyz, np.rint(points))
+    np.testing.assert_array_equal(laspy.read(out).xyz, np.rint(points))
     assert capsys.readouterr().out.endswith(
         f"{name}: coordinates are on a grid of 1, which changes them by up to 0.5\n"
     )
 
 
 def test_coordinates_that_a_grid_holds_are_written_without_a_word(tmp_path, capsys):
-    np.save(tmp_path / "a.npy", np.array([[0, 0, 0], [1, 0.25, 0.5]], "f4"))
+    source = tmp_path / "a.npy"
+    out = tmp_path / "out.las"
+    points = np.array([[0, 0, 0], [1, 0.25, 0.5]], "f4")
+    np.save(source, points)
 
-    write(tmp_path / "out.las", read(tmp_path / "a.npy", 1, 0))
+    write(out, read(source, 1, 0))
 
-    np.testing.assert_array_equal(laspy.read(tmp_path / "out.las").x, [0, 1])
+    np.testing.assert_array_equal(laspy.read(out).x, [0, 1])
     assert capsys.readouterr().out == ""

@@ -11,46 +11,87 @@ from mops_lightning.data.formats.registry import read
 from mops_lightning.errors import UserError
 from tests.support.meshes import packed_glb, quantised_glb
 
-HEAD = (
-    "ply\nformat {form} 1.0\nelement camera 1\nproperty float f\n"
-    "element vertex 4\nproperty double X\nproperty double Y\nproperty double Z\n"
-    "property float heat\nproperty uchar red\nproperty int part\n{more}"
-    "element face 2\nproperty ushort zone\nproperty list uchar int vertex_indices\nend_header\n"
-)
+HEAD = """\
+ply
+format {form} 1.0
+element camera 1
+property float f
+element vertex 4
+property double X
+property double Y
+property double Z
+property float heat
+property uchar red
+property int part
+{more}element face 2
+property ushort zone
+property list uchar int vertex_indices
+end_header
+"""
 
-CORNERS = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]
+CORNERS = [
+    (0, 0, 0),
+    (1, 0, 0),
+    (1, 1, 0),
+    (0, 1, 0),
+]
+
+
+VERTICES = [
+    (0, 0, 0, 0, 0, 0),
+    (1, 0, 0, 1, 0, 1),
+    (1, 1, 0, 1, 100, 2),
+    (0, 1, 0, 0, 100, 3),
+]
+"""Corners with heat, which is x, red, which is 100 y, and their rows."""
+
+
+FACES = [
+    (5, 3, 0, 1, 2),
+    (6, 4, 0, 1, 2, 3),
+]
+"""Zones, numbers of corners, and corners."""
 
 
 def square(path, is_ascii):
-    """Write a unit square of a triangle and a quad over it; heat is x, red is 100 y."""
-    rows = [(*corner, corner[0], 100 * corner[1], place) for place, corner in enumerate(CORNERS)]
-    faces = [(5, 3, 0, 1, 2), (6, 4, 0, 1, 2, 3)]
+    """Write a unit square of a triangle and a quad over it."""
     if is_ascii:
-        lines = ["1.5", *(" ".join(map(str, row)) for row in (*rows, *faces))]
+        lines = ["1.5"]
+        for row in (*VERTICES, *FACES):
+            lines.append(" ".join(map(str, row)))
         path.write_text(HEAD.format(form="ascii", more="") + "\n".join(lines) + "\n")
         return
-    body = struct.pack("<f", 1.5)
-    body += b"".join(struct.pack("<3dfBi", *row) for row in rows)
-    body += b"".join(struct.pack(f"<HB{face[1]}i", *face) for face in faces)
-    path.write_bytes(HEAD.format(form="binary_little_endian", more="").encode() + body)
+    head = HEAD.format(form="binary_little_endian", more="")
+    content = head.encode() + struct.pack("<f", 1.5)
+    for vertex in VERTICES:
+        content += struct.pack("<3dfBi", *vertex)
+    for face in FACES:
+        number = face[1]
+        content += struct.pack(f"<HB{number}i", *face)
+    path.write_bytes(content)
 
 
 @pytest.mark.parametrize("is_ascii", [True, False])
 def test_ply_of_triangle_and_quad_is_sampled_with_its_numbers(is_ascii, tmp_path):
-    square(tmp_path / "a.ply", is_ascii)
+    path = tmp_path / "a.ply"
+    square(path, is_ascii)
 
-    table = read(tmp_path / "a.ply", 2000, 0)
+    table = read(path, 2000, 0)
 
     x, y, _ = table.points.T
+    red = table.columns["red"]
+    part = table.columns["part"]
+    zone = table.columns["zone"]
     np.testing.assert_allclose(table.columns["heat"], x, atol=1e-6)
-    np.testing.assert_array_equal(table.columns["red"], np.rint(100 * y))
-    assert table.columns["red"].dtype == np.uint8
-    corner = np.abs(table.points[:, None] - CORNERS).sum(2).argmin(1)
-    near = np.sort(np.abs(table.points[:, None] - CORNERS).sum(2), 1)[:, 0] < 0.3
-    np.testing.assert_array_equal(table.columns["part"][near], corner[near])
-    below = y > x  # only the quad is there
-    assert set(table.columns["zone"][below]) == {6}
-    assert set(table.columns["zone"]) == {5, 6}
+    np.testing.assert_array_equal(red, np.rint(100 * y))
+    assert red.dtype == np.uint8
+    to_corners = np.abs(table.points[:, None] - CORNERS).sum(2)
+    is_near = to_corners.min(1) < 0.3
+    nearest_corner = to_corners.argmin(1)
+    np.testing.assert_array_equal(part[is_near], nearest_corner[is_near])
+    only_quad = y > x
+    assert set(zone[only_quad]) == {6}
+    assert set(zone) == {5, 6}
     assert table.form.left_out == ("element camera",)
 
 
@@ -66,54 +107,75 @@ def test_ply_vertices_of_a_mesh_are_all_its_rows(is_ascii, tmp_path):
 
 
 def test_ply_with_lists_of_different_lengths_is_read(tmp_path):
-    axes = "".join(f"property float {axis}\n" for axis in "xyz")
-    head = (
-        f"ply\nformat binary_big_endian 1.0\nelement chunks 2\nproperty list uint short items\n"
-        f"element point 2\n{axes}property list uchar int seen\nproperty uchar red\nend_header\n"
-    )
-    chunks = struct.pack(">Ihh", 2, 7, 8) + struct.pack(">I", 0)
-    rows = struct.pack(">fffBiB", 1, 2, 3, 1, 9, 50) + struct.pack(">fffBiiB", 4, 5, 6, 2, 8, 7, 60)
-    (tmp_path / "a.ply").write_bytes(head.encode() + chunks + rows)
+    path = tmp_path / "a.ply"
+    head = """\
+ply
+format binary_big_endian 1.0
+element chunks 2
+property list uint short items
+element point 2
+property float x
+property float y
+property float z
+property list uchar int seen
+property uchar red
+end_header
+"""
+    content = head.encode()
+    content += struct.pack(">Ihh", 2, 7, 8)
+    content += struct.pack(">I", 0)
+    content += struct.pack(">fffBiB", 1, 2, 3, 1, 9, 50)
+    content += struct.pack(">fffBiiB", 4, 5, 6, 2, 8, 7, 60)
+    path.write_bytes(content)
 
-    table = read(tmp_path / "a.ply", 9, 0)
+    table = read(path, 9, 0)
 
     assert table.points.tolist() == [[1, 2, 3], [4, 5, 6]]
     assert table.columns["red"].tolist() == [50, 60]
     assert table.form.left_out == ("seen", "element chunks")
 
 
+def normals_of(table):
+    columns = table.columns
+    return np.column_stack([columns["nx"], columns["ny"], columns["nz"]])
+
+
 @pytest.mark.parametrize("suffix", [".glb", ".obj", ".ply"])
 def test_normals_and_colours_of_vertices_reach_sampled_points(suffix, tmp_path):
+    path = tmp_path / f"a{suffix}"
     ball = trimesh.creation.icosphere(subdivisions=4)
-    colours = np.full((len(ball.vertices), 4), 255, np.uint8)
-    colours[:, 0] = np.rint(127 * (ball.vertices[:, 2] + 1))
+    height = ball.vertices[:, 2] + 1
+    colours = np.full((len(height), 4), 255, np.uint8)
+    colours[:, 0] = np.rint(127 * height)
     ball.visual.vertex_colors = colours
     options = {} if suffix == ".ply" else {"include_normals": True}
     assert ball.vertex_normals is not None  # so that it is exported
-    ball.export(tmp_path / f"a{suffix}", **options)
+    ball.export(path, **options)
 
-    table = read(tmp_path / f"a{suffix}", 500, 0)
+    table = read(path, 500, 0)
 
-    normals = np.stack([table.columns[name] for name in ("nx", "ny", "nz")], 1)
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
+    normals = normals_of(table)
+    lengths = np.linalg.norm(normals, axis=1)
+    np.testing.assert_allclose(lengths, 1, atol=1e-6)
     np.testing.assert_allclose(normals, table.points, atol=0.01)  # those of faces differ by 0.03
-    expected = 127 * (table.points[:, 2] + 1)
-    np.testing.assert_allclose(table.columns["red"].astype(float), expected, atol=3)
+    red = table.columns["red"].astype(float)
+    expected_red = 127 * (table.points[:, 2] + 1)
+    np.testing.assert_allclose(red, expected_red, atol=3)
 
 
 def test_glb_normals_follow_an_uneven_scale(tmp_path):
+    path = tmp_path / "a.glb"
     scene = trimesh.Scene()
     ball = trimesh.creation.icosphere(subdivisions=4)
     assert ball.vertex_normals is not None
     scene.add_geometry(ball, transform=np.diag([1, 2, 3, 1]))
-    (tmp_path / "a.glb").write_bytes(scene.export(file_type="glb", include_normals=True))
+    path.write_bytes(scene.export(file_type="glb", include_normals=True))
 
-    table = read(tmp_path / "a.glb", 500, 0)
+    table = read(path, 500, 0)
 
-    normals = np.stack([table.columns[name] for name in ("nx", "ny", "nz")], 1)
-    expected = table.points / [1, 4, 9]
-    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
-    np.testing.assert_allclose(normals, expected, atol=0.02)
+    gradients = table.points / [1, 4, 9]
+    lengths = np.linalg.norm(gradients, axis=1, keepdims=True)
+    np.testing.assert_allclose(normals_of(table), gradients / lengths, atol=0.02)
 
 
 @pytest.mark.parametrize("sparse", [False, True])
@@ -138,11 +200,13 @@ def test_glb_that_needs_an_extension_is_refused_by_its_name(name, tmp_path):
 
 
 def test_colours_that_a_part_of_a_scene_lacks_are_named(tmp_path):
+    path = tmp_path / "a.glb"
     ball = trimesh.creation.icosphere(subdivisions=1)
     ball.visual.vertex_colors = np.full((len(ball.vertices), 4), 9, np.uint8)
-    scene = trimesh.Scene([ball, trimesh.creation.box()])
-    (tmp_path / "a.glb").write_bytes(scene.export(file_type="glb"))
+    box = trimesh.creation.box()
+    scene = trimesh.Scene([ball, box])
+    path.write_bytes(scene.export(file_type="glb"))
 
-    table = read(tmp_path / "a.glb", 9, 0)
+    table = read(path, 9, 0)
 
     assert table.form.left_out == ("red", "green", "blue", "alpha")
