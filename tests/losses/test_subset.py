@@ -1,3 +1,6 @@
+import itertools
+from statistics import mean
+
 import pytest
 import torch
 
@@ -10,15 +13,22 @@ from tests.support.plain import squared
 def test_subset_loss_equals_double_loop(rng):
     points = torch.randn(3, 12, 3, dtype=torch.float64, generator=rng)
     samples = torch.randn(3, 5, 3, dtype=torch.float64, generator=rng, requires_grad=True)
-    expected = torch.tensor(0.0, dtype=torch.float64)
+
+    def loss_of(samples):
+        return subset_loss(points, samples)
+
+    loss = loss_of(samples)
+
+    nearest = []
     for cloud, sample in zip(points, samples, strict=True):
         for q in sample:
-            expected = expected + min(squared(q, p) for p in cloud) / 5 / 3
-    loss = subset_loss(points, samples)
+            nearest.append(min(squared(q, p) for p in cloud))
+    expected = torch.stack(nearest).mean()
     torch.testing.assert_close(loss, expected)
-    slopes = torch.autograd.grad(expected, samples)
-    torch.testing.assert_close(torch.autograd.grad(loss, samples), slopes)
-    assert torch.autograd.gradcheck(lambda q: subset_loss(points, q), (samples,))
+    gradient = torch.autograd.grad(loss, samples)
+    expected_gradient = torch.autograd.grad(expected, samples)
+    torch.testing.assert_close(gradient, expected_gradient)
+    assert torch.autograd.gradcheck(loss_of, (samples,))
 
 
 def test_subset_loss_of_input_points_is_zero(rng):
@@ -30,23 +40,30 @@ def plain_simplification_loss(points, samples, coverage, per_point):
     """The loss as published, one number at a time."""
     total = 0.0
     for cloud, sample in zip(points, samples, strict=True):
-        to_cloud = [min(float((q - p).square().sum()) for p in cloud) for q in sample]
-        from_cloud = [min(float((q - p).square().sum()) for q in sample) for p in cloud]
-        weight = coverage + per_point * len(to_cloud)
-        mean = sum(to_cloud) / len(to_cloud)
-        total += mean + max(to_cloud) + weight * sum(from_cloud) / len(from_cloud)
+        to_cloud = plain_nearest(sample, cloud)
+        from_cloud = plain_nearest(cloud, sample)
+        weight = coverage + per_point * len(sample)
+        total += mean(to_cloud) + max(to_cloud) + weight * mean(from_cloud)
     return total / len(points)
+
+
+def plain_nearest(points, others):
+    """Return the squared distance of each point to the nearest of the others."""
+    distances = []
+    for q in points:
+        distances.append(min(float(squared(q, p)) for p in others))
+    return distances
 
 
 @pytest.mark.parametrize(("coverage", "per_point"), [(1.0, 0.0), (0.5, 1 / 30), (0.0, 1 / 64)])
 def test_simplification_loss_equals_double_loop(coverage, per_point, rng):
     points = torch.randn(3, 17, 3, generator=rng)
     samples = torch.randn(3, 5, 3, generator=rng)
-    value = float(simplification_loss(points, samples, coverage, per_point))
+
+    value = simplification_loss(points, samples, coverage, per_point)
+
     expected = plain_simplification_loss(points, samples, coverage, per_point)
-    assert value == pytest.approx(expected, rel=1e-5)
-    default = plain_simplification_loss(points, samples, 1.0, 0.0)
-    assert float(simplification_loss(points, samples)) == pytest.approx(default, rel=1e-5)
+    assert float(value) == pytest.approx(expected, rel=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -67,32 +84,50 @@ def test_losses_of_several_sizes_equal_each_size(losses, loss, weights, rng):
         torch.testing.assert_close(got, want)
 
 
+def test_simplification_loss_has_weights_of_one_and_zero_by_default(rng):
+    points = torch.randn(3, 17, 3, generator=rng)
+    samples = torch.randn(3, 5, 3, generator=rng)
+
+    value = simplification_loss(points, samples)
+
+    expected = plain_simplification_loss(points, samples, 1.0, 0.0)
+    assert float(value) == pytest.approx(expected, rel=1e-5)
+
+
 def plain_overlap(matrix, m):
     """Loop over clouds and pairs of columns."""
-    values = []
-    for cloud in matrix.dense()[..., :m]:
-        pairs = [(i, j) for i in range(m) for j in range(m) if i != j]
-        values.append(sum((cloud[:, i] @ cloud[:, j]) ** 2 for i, j in pairs) / m)
-    return torch.stack([torch.as_tensor(value) for value in values]).mean()
+    clouds = matrix.dense()[..., :m]
+    total = torch.zeros((), dtype=clouds.dtype)
+    for cloud in clouds:
+        for i, j in itertools.permutations(range(m), 2):
+            product = cloud[:, i] @ cloud[:, j]
+            total = total + product**2
+    return total / m / len(clouds)
 
 
 @pytest.mark.parametrize("per_cloud", [False, True])
 def test_overlap_losses_equal_loop_over_pairs(per_cloud, rng):
     shape = (3, 7, 5) if per_cloud else (7, 5)
-    queries = torch.randn(shape, dtype=torch.float64, generator=rng)
-    keys = torch.randn(3, 20, 5, dtype=torch.float64, generator=rng).requires_grad_()
-    queries.requires_grad_()
+    queries = torch.randn(shape, dtype=torch.float64, generator=rng, requires_grad=True)
+    keys = torch.randn(3, 20, 5, dtype=torch.float64, generator=rng, requires_grad=True)
     matrix = SamplingMatrix(queries, keys, 0.3)
-    found = overlap_losses(matrix, (2, 5, 7))
-    for m, loss in found.items():
+
+    losses = overlap_losses(matrix, (2, 5, 7))
+
+    assert list(losses) == [2, 5, 7]
+    for m, loss in losses.items():
         expected = plain_overlap(matrix, m)
         torch.testing.assert_close(loss, expected)
-        slopes = torch.autograd.grad(loss, (queries, keys), retain_graph=True)
-        torch.testing.assert_close(slopes, torch.autograd.grad(expected, (queries, keys)))
+        gradients = torch.autograd.grad(loss, (queries, keys), retain_graph=True)
+        expected_gradients = torch.autograd.grad(expected, (queries, keys))
+        torch.testing.assert_close(gradients, expected_gradients)
 
 
 def test_overlap_is_zero_for_columns_without_common_points():
-    keys = 1e3 * torch.eye(4)[None]
-    assert overlap_losses(SamplingMatrix(torch.eye(4)[:3], keys, 1.0), (1, 3)) == {1: 0, 3: 0}
-    same = SamplingMatrix(torch.eye(4)[[0, 0]], keys, 1.0)
+    unit = torch.eye(4)
+    keys = 1e3 * unit[None]
+    different = SamplingMatrix(unit[:3], keys, 1.0)
+    same = SamplingMatrix(unit[[0, 0]], keys, 1.0)
+
+    assert overlap_losses(different, (1, 3)) == {1: 0, 3: 0}
     assert overlap_losses(same, (2,)) == {2: 1}

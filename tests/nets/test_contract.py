@@ -38,12 +38,18 @@ ALL = {**NETS, **CLASSIFIERS}
 def test_output_is_independent_of_order_and_batch(name, rng):
     net = ALL[name](50).eval()
     points = torch.randn(3, 40, 3, generator=rng)
-    out = net(points)
-    assert out.shape == ((3, 5) if name in CLASSIFIERS else (3, 50, 3))
     order = torch.randperm(40, generator=rng)
-    torch.testing.assert_close(net(points[:, order]), out, atol=1e-5, rtol=1e-4)
-    torch.testing.assert_close(net(points[1:2]), out[1:2], atol=1e-5, rtol=1e-4)
-    assert net(points[:, :7]).shape == net(points[:, :1]).shape == out.shape
+    shape = (3, 5) if name in CLASSIFIERS else (3, 50, 3)
+
+    out = net(points)
+    out_in_order = net(points[:, order])
+    out_alone = net(points[1:2])
+
+    assert out.shape == shape
+    torch.testing.assert_close(out_in_order, out, atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(out_alone, out[1:2], atol=1e-5, rtol=1e-4)
+    assert net(points[:, :7]).shape == shape
+    assert net(points[:, :1]).shape == shape
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -51,9 +57,15 @@ def test_all_parameters_have_gradients(name, rng):
     net = ALL[name](50)
     for module in net.modules():
         if isinstance(module, TransformNet):  # its last weights are zero, which stops gradients
-            torch.nn.init.normal_(list(module.head.parameters())[-2], std=0.01)
-    net(torch.randn(3, 40, 3, generator=rng)).square().sum().backward()
-    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in net.parameters())
+            *_, last_weight, _ = module.head.parameters()
+            torch.nn.init.normal_(last_weight, std=0.01)
+    points = torch.randn(3, 40, 3, generator=rng)
+
+    net(points).square().sum().backward()
+
+    for parameter_name, weights in net.named_parameters():
+        assert weights.grad is not None, parameter_name
+        assert weights.grad.abs().sum() > 0, parameter_name
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -82,10 +94,14 @@ def test_number_of_points_is_variable(name, n, rng):
 def test_result_follows_from_maxima_of_point_features(name, rng):
     net: Any = ALL[name](50).eval()
     points = torch.randn(2, 40, 3, generator=rng)
+
     features = net.point_features(points)
+    features_of_two = net.point_features(points[:, 7:9])
+
     assert features.min() >= 0
-    torch.testing.assert_close(net.from_pooled(features.amax(1)), net(points))
-    torch.testing.assert_close(net.point_features(points[:, 7:9]), features[:, 7:9])
+    maxima = features.amax(1)
+    torch.testing.assert_close(net.from_pooled(maxima), net(points))
+    torch.testing.assert_close(features_of_two, features[:, 7:9])
 
 
 @pytest.mark.parametrize(

@@ -12,10 +12,13 @@ from tests.support.plain import plain_farthest
 def test_fps_equals_double_loop(n, m, dtype, rng):
     points = torch.randn(3, n, 3, dtype=dtype, generator=rng)
     start = torch.randint(n, (3,), generator=rng)
+
     indices = farthest_point_sample(points, m, start=start)
+
     assert indices.dtype == torch.int64
-    for cloud, first, chosen in zip(points, start.tolist(), indices.tolist(), strict=True):
-        assert chosen == plain_farthest(cloud, [first], m)
+    for cloud, first, chosen in zip(points, start, indices, strict=True):
+        expected = plain_farthest(cloud, [int(first)], m)
+        assert chosen.tolist() == expected
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
@@ -23,10 +26,14 @@ def test_fps_equals_double_loop(n, m, dtype, rng):
 @pytest.mark.parametrize("grid", [False, True])  # a grid has many ties and copies
 def test_fps_on_a_gpu_is_that_of_a_cpu(n, m, grid, rng):
     points = torch.randn(3, n, 3, generator=rng)
-    points = (4 * points).round() if grid else points
+    if grid:
+        points = (4 * points).round()
     start = torch.randint(n, (3,), generator=rng)
-    on_gpu = farthest_point_sample(points.cuda(), m, start.cuda()).cpu()
-    assert torch.equal(on_gpu, farthest_point_sample(points, m, start))
+
+    on_gpu = farthest_point_sample(points.cuda(), m, start.cuda())
+
+    on_cpu = farthest_point_sample(points, m, start)
+    assert torch.equal(on_gpu.cpu(), on_cpu)
 
 
 @pytest.mark.usefixtures("farthest_form")
@@ -34,11 +41,15 @@ def test_fps_on_a_gpu_is_that_of_a_cpu(n, m, grid, rng):
 def test_fps_multiplies_distances_by_weights(n, m, rng):
     points = torch.randn(3, n, 3, dtype=torch.float64, generator=rng)
     weight = torch.rand(3, n, generator=rng).square() * 100
-    weight[:, : n // 4] = 0  # these are the last
+    without_weight = n // 4
+    weight[:, :without_weight] = 0  # these are the last
+    number = min(m, n - without_weight)
+
     indices = farthest_point_sample(points, m, n - 1, weight)
-    for cloud, part, chosen in zip(points, weight, indices.tolist(), strict=True):
-        expected = plain_farthest(cloud, [n - 1], min(m, n - n // 4), part)
-        assert chosen[: len(expected)] == expected
+
+    for row, chosen in enumerate(indices.tolist()):
+        expected = plain_farthest(points[row], [n - 1], number, weight[row])
+        assert chosen[:number] == expected
         assert len(set(chosen)) == m
 
 
@@ -64,10 +75,20 @@ def test_fps_of_coincident_points_is_distinct():
     assert indices[1, 1] == 10  # the lowest of the farthest
 
 
-@pytest.mark.parametrize(("m", "start"), [(0, 0), (6, 0), (2, 5), (2, -1)])
-def test_fps_out_of_range_raises(m, start):
-    with pytest.raises(UserError, match="m must be" if start == 0 else "start must be"):
-        farthest_point_sample(torch.zeros(1, 5, 3), m, start=start)
+@pytest.mark.parametrize(
+    ("m", "start", "said"),
+    [
+        (0, 0, "m must be"),
+        (6, 0, "m must be"),
+        (2, 5, "start must be"),
+        (2, -1, "start must be"),
+    ],
+)
+def test_fps_out_of_range_raises(m, start, said):
+    points = torch.zeros(1, 5, 3)
+
+    with pytest.raises(UserError, match=said):
+        farthest_point_sample(points, m, start=start)
 
 
 def test_fps_single_cloud_raises():
@@ -79,11 +100,14 @@ def test_fps_single_cloud_raises():
 def test_fill_equals_double_loop(rng):
     points = torch.randn(3, 45, 3, generator=rng)
     given = torch.tensor([1, 6, 12])
-    indices = torch.stack([torch.randperm(45, generator=rng)[:12] for _ in range(3)])
+    indices = torch.rand(3, 45, generator=rng).argsort(1)[:, :12]
+
     filled = farthest_point_fill(points, indices, given)
-    for b in range(3):
-        chosen = indices[b, : given[b]].tolist()
-        assert filled[b].tolist() == plain_farthest(points[b], chosen, 12)
+
+    for cloud in range(3):
+        chosen = indices[cloud, : given[cloud]].tolist()
+        expected = plain_farthest(points[cloud], chosen, 12)
+        assert filled[cloud].tolist() == expected
 
 
 def test_fill_of_points_with_gradients_equals_fill_without(rng):

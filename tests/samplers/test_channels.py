@@ -27,6 +27,7 @@ from mops_lightning.channels import Channel, PointChannels
 from mops_lightning.errors import UserError
 from mops_lightning.losses.subset import subset_losses
 from mops_lightning.nets.pointnet import PointNetVanilla
+from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.base import stream_sample
 from tests.support.samplers import MOPS_LAYERS, SMALL, moved
 
@@ -46,6 +47,9 @@ INDEX = {
     "poisson": PoissonSampler,
     "serial": SerialSampler,
 }
+LOCAL: dict[str, Any] = {"anchors": "fps", "candidates": 2, "neighbours": 3}
+
+
 LEARNED = {
     "gumbel": lambda channels: GumbelSampler(M, feature_channels=(8, 6), point_channels=channels),
     "mops": lambda channels: MOPSNet(M, point_channels=channels, **MOPS_LAYERS),
@@ -53,11 +57,7 @@ LEARNED = {
     "anchors": lambda channels: moved(
         MOPSNet(M, anchors="fps", point_channels=channels, **MOPS_LAYERS)
     ),
-    "local": lambda channels: moved(
-        MOPSNet(
-            M, anchors="fps", candidates=2, neighbours=3, point_channels=channels, **MOPS_LAYERS
-        )
-    ),
+    "local": lambda channels: moved(MOPSNet(M, point_channels=channels, **LOCAL, **MOPS_LAYERS)),
     "snet": lambda channels: SNet(M, point_channels=channels, **SMALL),
     "samplenet": lambda channels: SampleNet(M, k=3, point_channels=channels, **SMALL),
     "progressive": lambda channels: ProgressiveSampleNet(M, k=3, point_channels=channels, **SMALL),
@@ -86,15 +86,17 @@ def test_index_sampler_selects_by_coordinates_and_brings_all_channels(name, clou
 
 
 def test_critical_points_are_chosen_by_a_net_with_channels(clouds):
-    net = PointNetVanilla(3, point_channels=CHANNELS)
-    changed = torch.cat([clouds[..., :3], -clouds[..., 3:]], 2)
+    sampler = CriticalSampler(M, PointNetVanilla(3, point_channels=CHANNELS))
+    coordinates = clouds[..., :3]
+    other_channels = torch.cat([coordinates, -clouds[..., 3:]], 2)
 
-    output = CriticalSampler(M, net)(clouds)
+    output = sampler(clouds)
+    output_of_others = sampler(other_channels)
 
-    assert torch.equal(output.points[0], clouds[0][output.indices[0]])
-    assert not torch.equal(CriticalSampler(M, net)(changed).indices, output.indices)
+    assert torch.equal(output.points, gather_points(clouds, output.indices))
+    assert not torch.equal(output_of_others.indices, output.indices)
     with pytest.raises(UserError, match=r"points must have shape \(B, N, 7\), 4 of them channels"):
-        CriticalSampler(M, net)(clouds[..., :3])
+        sampler(coordinates)
 
 
 @pytest.mark.parametrize("name", LEARNED)
@@ -113,12 +115,14 @@ def test_learned_sampler_returns_channels_with_normals_of_length_one(name, train
 @pytest.mark.parametrize("name", LEARNED)
 def test_learned_sampler_reads_its_channels(name, clouds):
     sampler = LEARNED[name](CHANNELS)
-    (first,) = [p for p in sampler.parameters() if p.ndim == 2 and p.shape[1] == 7]
+    matrices = [weights for weights in sampler.parameters() if weights.ndim == 2]
+    (first,) = [weights for weights in matrices if weights.shape[1] == 7]
 
-    output = sampler(clouds).points
+    sampled = sampler(clouds).points[..., :3]
 
-    (gradient,) = torch.autograd.grad(output[..., :3].square().sum(), first)
-    assert gradient[:, 3:].abs().sum() > 0
+    (gradient,) = torch.autograd.grad(sampled.square().sum(), first)
+    gradient_of_channels = gradient[:, 3:]
+    assert gradient_of_channels.abs().sum() > 0
 
 
 @pytest.mark.parametrize("name", ["mops", "fmops", "anchors", "local"])
@@ -127,18 +131,21 @@ def test_generated_points_are_the_transposed_matrix_times_points_and_channels(na
 
     output = sampler(clouds)
 
-    expected = output.matrix.dense().mT @ clouds
-    torch.testing.assert_close(output.points[..., :4], expected[..., :4])
-    torch.testing.assert_close(output.points[..., 4:], F.normalize(expected[..., 4:], dim=2))
+    means = output.matrix.dense().mT @ clouds
+    normals = F.normalize(means[..., 4:], dim=2)
+    torch.testing.assert_close(output.points[..., :4], means[..., :4])
+    torch.testing.assert_close(output.points[..., 4:], normals)
 
 
 @pytest.mark.parametrize("name", ["snet", "samplenet", "progressive"])
 def test_points_without_a_matrix_have_the_channels_of_the_nearest_point(name, clouds):
-    output = LEARNED[name](CHANNELS).eval()(clouds)
+    sampler = LEARNED[name](CHANNELS).eval()
 
-    rows = nearest(output.points[..., :3], clouds[..., :3])[1]
-    for b in range(B):
-        assert torch.equal(output.points[b, :, 3:], clouds[b, rows[b], 3:])
+    sampled = sampler(clouds).points
+
+    _, rows = nearest(sampled[..., :3], clouds[..., :3])
+    nearest_points = gather_points(clouds, rows)
+    assert torch.equal(sampled[..., 3:], nearest_points[..., 3:])
 
 
 def test_subset_loss_is_between_coordinates(clouds):
@@ -156,9 +163,8 @@ def test_weights_have_the_names_of_a_sampler_without_channels(name):
     with_channels = LEARNED[name](CHANNELS).state_dict()
 
     assert list(with_channels) == list(without)
-    different = [key for key in without if without[key].shape != with_channels[key].shape]
-    assert len(different) == 1
-    assert with_channels[different[0]].shape[1] == without[different[0]].shape[1] + 4
+    (wider,) = [key for key in without if without[key].shape != with_channels[key].shape]
+    assert with_channels[wider].shape[1] == without[wider].shape[1] + 4
 
 
 @pytest.mark.parametrize("name", LEARNED)
@@ -193,28 +199,6 @@ def test_streamed_sample_equals_the_whole(clouds):
     streamed = stream_sample(sampler, lambda: iter(clouds[0].split(15)))
 
     torch.testing.assert_close(streamed, sampler(clouds).points[0])
-
-
-@pytest.mark.parametrize("readout", ["generated", "completed"])
-def test_downsample_scales_channels_and_maps_them_back(readout, clouds):
-    sampler = LEARNED["mops"](CHANNELS).eval()
-    cloud = clouds[0]
-    centred = cloud[:, :3] - cloud[:, :3].mean(0)
-    seen = torch.cat([centred / centred.norm(dim=1).max(), cloud[:, 3:]], 1)
-    in_own_units = cloud.double()
-    in_own_units[:, :3] = 1000 + 20 * in_own_units[:, :3]
-    in_own_units[:, 3] = 100 + 50 * in_own_units[:, 3]
-
-    points, indices = sampler.downsample(in_own_units, readout=readout)
-
-    selected: Any = sampler.select(readout, seen[None], M)
-    expected, rows = selected
-    if readout == "completed":
-        assert torch.equal(indices, rows[0])
-        assert torch.equal(points, in_own_units[indices])
-    else:
-        torch.testing.assert_close(points[:, 3], 100 + 50 * expected[0, :, 3].double())
-        torch.testing.assert_close(points[:, 4:], expected[0, :, 4:].double())
 
 
 def test_downsample_without_the_channels_names_them(clouds):
@@ -257,3 +241,42 @@ def test_point_channels_takes_a_number_of_numpy():
 def test_point_channels_name_a_wrong_column(columns, message):
     with pytest.raises(UserError, match=message):
         PointChannels(columns)
+
+
+@pytest.fixture
+def cloud_in_own_units(clouds):
+    """The first cloud with coordinates around 1000 and an intensity around 100."""
+    cloud = clouds[0].double()
+    cloud[:, :3] = 1000 + 20 * cloud[:, :3]
+    cloud[:, 3] = 100 + 50 * cloud[:, 3]
+    return cloud
+
+
+def test_downsample_returns_chosen_points_in_the_units_that_were_given(clouds, cloud_in_own_units):
+    sampler = LEARNED["mops"](CHANNELS).eval()
+
+    points, rows = sampler.downsample(cloud_in_own_units, readout="completed")
+
+    selected: Any = sampler.select("completed", normalised(clouds[0])[None], M)
+    _, (expected_rows,) = selected
+    assert torch.equal(rows, expected_rows)
+    assert torch.equal(points, cloud_in_own_units[rows])
+
+
+def test_downsample_maps_generated_channels_back(clouds, cloud_in_own_units):
+    sampler = LEARNED["mops"](CHANNELS).eval()
+
+    points, _ = sampler.downsample(cloud_in_own_units, readout="generated")
+
+    selected: Any = sampler.select("generated", normalised(clouds[0])[None], M)
+    (seen,), _ = selected
+    intensity = 100 + 50 * seen[:, 3]
+    torch.testing.assert_close(points[:, 3], intensity.double())
+    torch.testing.assert_close(points[:, 4:], seen[:, 4:].double())
+
+
+def normalised(cloud):
+    """Return a cloud with its coordinates in the unit sphere."""
+    centred = cloud[:, :3] - cloud[:, :3].mean(0)
+    radius = centred.norm(dim=1).max()
+    return torch.cat([centred / radius, cloud[:, 3:]], 1)

@@ -1,6 +1,7 @@
 """The compiled loops, a plain form in torch, and the formula as published; the sampler."""
 
 from functools import partial
+
 import pytest
 import torch
 

@@ -1,10 +1,10 @@
-from mops_lightning.ops.points import gather_points
 import math
 
 import pytest
 import torch
 
 from mops_lightning.ops.nearest import k_nearest, nearest
+from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.samplenet import ProgressiveSampleNet, SampleNet, soft_projection
 from tests.support.losses import simplification_loss
 

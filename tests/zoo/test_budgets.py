@@ -81,45 +81,73 @@ def test_voxel_keeps_one_point_of_each():
 
 
 def test_voxel_with_weights_keeps_the_heaviest_point_of_each():
-    points = np.array([[0.1, 0.5, 0.5], [0.5, 0.5, 0.5], [0.9, 0.5, 0.5], [1.5, 0.5, 0.5]])
-    weight = np.array([3.0, 1.0, 5.0, 1.0])
-    of_middle = np.array([1.0, 1.0, 1.0, 1.0])
+    points = np.array(
+        [
+            [0.1, 0.5, 0.5],
+            [0.5, 0.5, 0.5],
+            [0.9, 0.5, 0.5],
+            [1.5, 0.5, 0.5],
+        ]
+    )
+    unequal = np.array([3.0, 1.0, 5.0, 1.0])
+    equal = np.array([1.0, 1.0, 1.0, 1.0])
 
-    _, heavy = downsample(points, voxel=1.0, weight=weight)
-    _, nearest = downsample(points, voxel=1.0, weight=of_middle)
+    _, heaviest = downsample(points, voxel=1.0, weight=unequal)
+    _, nearest = downsample(points, voxel=1.0, weight=equal)
 
-    assert heavy.tolist() == [2, 3]
+    assert heaviest.tolist() == [2, 3]
     assert nearest.tolist() == [1, 3]
 
 
 def test_spacing_of_equal_weights_follows_the_seed_as_without_weights():
     weight = torch.ones(200)
 
-    kept = [downsample(CLOUD, spacing=2.0, seed=seed, weight=weight)[1].tolist() for seed in (0, 7)]
+    _, weighted = downsample(CLOUD, spacing=2.0, seed=0, weight=weight)
+    _, weighted_by_other_seed = downsample(CLOUD, spacing=2.0, seed=7, weight=weight)
 
-    assert kept[0] != kept[1]
-    for seed, rows in zip((0, 7), kept, strict=True):
-        assert rows == downsample(CLOUD, spacing=2.0, seed=seed)[1].tolist()
+    _, plain = downsample(CLOUD, spacing=2.0, seed=0)
+    _, plain_by_other_seed = downsample(CLOUD, spacing=2.0, seed=7)
+    assert weighted.tolist() == plain.tolist()
+    assert weighted_by_other_seed.tolist() == plain_by_other_seed.tolist()
+    assert plain.tolist() != plain_by_other_seed.tolist()
 
 
 def test_voxel_generated_returns_means_of_all_columns():
-    points = np.array([[0.1, 0.1, 0.1, 4.0], [0.3, 0.5, 0.9, 6.0], [1.5, 0.5, 0.5, 1.0]])
+    points = np.array(
+        [
+            [0.1, 0.1, 0.1, 4.0],
+            [0.3, 0.5, 0.9, 6.0],
+            [1.5, 0.5, 0.5, 1.0],
+        ]
+    )
 
     means, rows = downsample(points, voxel=1.0, readout="generated")
 
+    expected = [
+        [0.2, 0.3, 0.5, 5.0],
+        [1.5, 0.5, 0.5, 1.0],
+    ]
     assert rows is None
-    np.testing.assert_allclose(means, [[0.2, 0.3, 0.5, 5.0], [1.5, 0.5, 0.5, 1.0]], atol=1e-10)
+    np.testing.assert_allclose(means, expected, atol=1e-10)
 
 
-def test_further_columns_stay_with_their_points():
-    points = np.concatenate([CLOUD.numpy(), np.arange(200.0)[:, None]], axis=1)
+@pytest.mark.parametrize(
+    "budget",
+    [
+        {"m": 10},
+        {"spacing": 2.0},
+        {"voxel": 3.0},
+        {"m": 10, "tile": 50},
+    ],
+)
+def test_further_columns_stay_with_their_points(budget):
+    row = np.arange(200.0)
+    points = np.column_stack([CLOUD.numpy(), row])
 
-    budgets: list[Any] = [{"m": 10}, {"spacing": 2.0}, {"voxel": 3.0}, {"m": 10, "tile": 50}]
-    for budget in budgets:
-        kept, rows = downsample(points, **budget)
-        assert np.array_equal(kept, points[rows])
-        assert np.array_equal(kept[:, 3], rows)
-    assert np.array_equal(downsample(points, 10)[1], downsample(points[:, :3], 10)[1])
+    kept, rows = downsample(points, **budget)
+
+    assert np.array_equal(kept, points[rows])
+    assert np.array_equal(kept[:, 3], rows)
 
 
 def test_whole_number_coordinates_are_kept():
@@ -132,25 +160,43 @@ def test_whole_number_coordinates_are_kept():
     assert len(set(rows.tolist())) == 5
 
 
+def test_further_columns_do_not_change_the_choice():
+    coordinates = CLOUD.numpy()
+    points = np.column_stack([coordinates, np.arange(200.0)])
+
+    _, rows = downsample(points, 10)
+    _, rows_of_coordinates = downsample(coordinates, 10)
+
+    assert np.array_equal(rows, rows_of_coordinates)
+
+
 def test_list_of_clouds_of_several_sizes():
-    clouds = [CLOUD[:50], CLOUD[:120].numpy(), CLOUD[:4]]
+    medium = CLOUD[:50]
+    large = CLOUD[:120].numpy()
+    small = CLOUD[:4]
 
-    points, rows = downsample(clouds, 10)
+    points, rows = downsample([medium, large, small], 10)
 
-    assert [len(cloud) for cloud in points] == [10, 10, 4]
-    assert torch.equal(rows[0], downsample(CLOUD[:50], 10)[1])
-    assert isinstance(points[1], np.ndarray)
+    of_medium, of_large, of_small = points
+    assert len(of_medium) == 10
+    assert len(of_large) == 10
+    assert len(of_small) == 4
+    _, rows_alone = downsample(medium, 10)
+    assert torch.equal(rows[0], rows_alone)
+    assert isinstance(of_large, np.ndarray)
     assert rows[2].tolist() == [0, 1, 2, 3]
 
 
 def test_another_m_per_cloud():
+    clouds = CLOUD.view(2, 100, 3)
     batch = torch.arange(200) // 100
 
-    _, rows = downsample(CLOUD.view(2, 100, 3), [5, 0.2])
+    _, (first, second) = downsample(clouds, [5, 0.2])
     flat_points, flat_rows = downsample(CLOUD, [5, 0.2], batch=batch)
 
-    assert [len(part) for part in rows] == [5, 20]
-    assert flat_rows.tolist() == [*rows[0].tolist(), *(rows[1] + 100).tolist()]
+    assert len(first) == 5
+    assert len(second) == 20
+    assert flat_rows.tolist() == [*first.tolist(), *(second + 100).tolist()]
     assert torch.equal(flat_points, CLOUD[flat_rows])
 
 
@@ -174,25 +220,38 @@ def test_spacing_and_voxel_of_a_batch_are_lists():
 
 
 def test_space_makes_columns_count():
-    points = np.concatenate([CLOUD.numpy(), np.zeros((200, 1))], axis=1)
+    points = np.column_stack([CLOUD.numpy(), np.zeros(200)])
     points[17, 3] = 100.0
 
-    assert 17 in downsample(points, 2, start=0, space=(1, 1, 1, 1))[1]
-    assert 17 not in downsample(points, 2, start=0, space=(1, 1, 1, 0))[1]
-    scaled = points.astype(np.float64)[:, :3] * [1, 1, 2]
-    expected = keep_spaced(scaled, 2.0)
-    assert downsample(points, spacing=2.0, space=(1, 1, 2, 0))[1].tolist() == expected.tolist()
+    _, with_column = downsample(points, 2, start=0, space=(1, 1, 1, 1))
+    _, without_column = downsample(points, 2, start=0, space=(1, 1, 1, 0))
+
+    assert 17 in with_column
+    assert 17 not in without_column
+
+
+def test_space_scales_coordinates_for_a_spacing():
+    coordinates = CLOUD.numpy()
+    points = np.column_stack([coordinates, np.zeros(200)])
+
+    _, rows = downsample(points, spacing=2.0, space=(1, 1, 2, 0))
+
+    scaled = coordinates.astype(np.float64) * [1, 1, 2]
+    assert rows.tolist() == keep_spaced(scaled, 2.0).tolist()
 
 
 def test_space_of_poisson_scales_the_columns():
-    points = np.concatenate([CLOUD.numpy(), CLOUD.numpy()[:, :1] ** 2], axis=1)
-    used = (points * [1, 1, 2, 3]).astype(np.float64)
-    sphere = UnitSphere.around(used).normalise(used)[None]
+    coordinates = CLOUD.numpy()
+    points = np.column_stack([coordinates, coordinates[:, 0] ** 2])
 
     _, rows = downsample(points, 40, "poisson", space=(1, 1, 2, 3))
 
-    assert rows.tolist() == poisson_rows(sphere, 40)[0].tolist()
-    assert rows.tolist() != downsample(points, 40, "poisson")[1].tolist()
+    scaled = (points * [1, 1, 2, 3]).astype(np.float64)
+    sphere = UnitSphere.around(scaled).normalise(scaled)
+    (expected,) = poisson_rows(sphere[None], 40)
+    _, rows_of_coordinates = downsample(points, 40, "poisson")
+    assert rows.tolist() == expected.tolist()
+    assert rows.tolist() != rows_of_coordinates.tolist()
 
 
 def test_tile_keeps_m_points():
