@@ -12,21 +12,38 @@ from tests.support.downsample import call, done, refused
 @pytest.mark.parametrize("suffix", [".ply", ".npy", ".bin", ".laz"])
 @pytest.mark.parametrize("readout", ["generated", "matched"])
 def test_chunks_equal_whole_file(suffix, readout, folder, tmp_path):
+    source = tmp_path / f"in{suffix}"
     points = np.random.default_rng(1).normal(size=(500, 3)).astype(np.float32).astype(float)
-    points[200:] = points[np.arange(300) % 100]  # of equal points, the first one is matched
+    points[200:] = np.tile(points[:100], (3, 1))  # of equal points, the first one is matched
+    number = "40 of 500 points"
     if suffix != ".laz":  # it holds whole numbers, NaN is none
         points[100:160] = np.nan
-    source = tmp_path / f"in{suffix}"
-    WRITERS[suffix](source, Table(points, {"intensity": np.arange(500, dtype=np.uint16)}))
+        number = "40 of 440 points (60 more"
+    intensity = np.arange(500, dtype=np.uint16)
+    WRITERS[suffix](source, Table(points, {"intensity": intensity}))
     settings = ["--weights", folder, "--readout", readout]
-    assert call(source, tmp_path / "whole.npz", *settings)[0] == 0
+
+    done(source, tmp_path / "whole.npz", *settings)
     out = done(source, tmp_path / "parts.npz", *settings, "--chunk", 60)
-    assert ("40 of 500 points" if suffix == ".laz" else "40 of 440 points (60 more") in out
-    whole, parts = (read(tmp_path / f"{name}.npz", 9, 0) for name in ("whole", "parts"))
+
+    assert number in out
+    whole = read(tmp_path / "whole.npz", 9, 0)
+    parts = read(tmp_path / "parts.npz", 9, 0)
     np.testing.assert_allclose(parts.points, whole.points, atol=1e-5)
     assert list(parts.columns) == list(whole.columns)
     for name, column in whole.columns.items():
         np.testing.assert_array_equal(parts.columns[name], column)
+
+
+def drawn_by_parts(rows, number, seed):
+    """Return the rows with the smallest keys, which are drawn for each part of 120 rows."""
+    keys = []
+    for start in range(0, 500, 120):
+        of_part = (rows >= start) & (rows < start + 120)
+        rng = np.random.default_rng([seed, start])
+        keys.append(rng.random(of_part.sum()))
+    smallest = np.concatenate(keys).argsort()[:number]
+    return np.sort(rows[smallest])
 
 
 @pytest.mark.parametrize(
@@ -43,31 +60,40 @@ def test_other_methods_sample_random_points_of_all_parts(settings, folder, tmp_p
     points = np.random.default_rng(1).normal(size=(500, 3))
     points[100:160] = np.nan
     finite = np.delete(np.arange(500), slice(100, 160))
-    parts = [finite[finite // 120 == place] for place in range(5)]
-    keys = [np.random.default_rng([3, 120 * i]).random(len(part)) for i, part in enumerate(parts)]
-    drawn = np.sort(np.concatenate(parts)[np.concatenate(keys).argsort()[:200]])
-    np.save(tmp_path / "all.npy", np.column_stack([points, np.arange(500)]))
-    np.save(tmp_path / "drawn.npy", np.column_stack([points, np.arange(500)])[drawn])
-    settings = [folder if one == "FOLDER" else one for one in settings]
+    drawn = drawn_by_parts(finite, 200, seed=3)
+    numbered = np.column_stack([points, np.arange(500)])
+    np.save(tmp_path / "all.npy", numbered)
+    np.save(tmp_path / "drawn.npy", numbered[drawn])
+    settings = [folder if value == "FOLDER" else value for value in settings]
     settings += ["--m", 30, "--seed", 3]
-    assert call(tmp_path / "drawn.npy", tmp_path / "want.npy", *settings)[0] == 0
+    done(tmp_path / "drawn.npy", tmp_path / "expected.npy", *settings)
+
     status, out, _ = call(tmp_path / "all.npy", tmp_path / "out.npy", *settings, "--chunk", 200)
-    assert (status, "30 of 440 points (60 more without" in out) == (0, True)
-    np.testing.assert_array_equal(np.load(tmp_path / "out.npy"), np.load(tmp_path / "want.npy"))
+
+    assert status == 0
+    assert "30 of 440 points (60 more without" in out
+    kept = np.load(tmp_path / "out.npy")
+    expected = np.load(tmp_path / "expected.npy")
+    np.testing.assert_array_equal(kept, expected)
 
 
-def test_bounds_hold_for_chunks_and_whole_files(folder, tmp_path):
+@pytest.mark.parametrize("chunk", [[], ["--chunk", 60]])
+def test_bounds_hold_for_chunks_and_whole_files(chunk, folder, tmp_path):
     points = np.random.default_rng(1).normal(size=(500, 3))
+    is_inside = (np.abs(points[:, :2]) <= 1).all(1)
     np.save(tmp_path / "all.npy", points)
-    part = points[(np.abs(points[:, :2]) <= 1).all(1)]
-    np.save(tmp_path / "part.npy", part)
+    np.save(tmp_path / "part.npy", points[is_inside])
     settings = ["--weights", folder, "--readout", "matched", "--m", 30]
-    assert call(tmp_path / "part.npy", tmp_path / "want.npy", *settings)[0] == 0
-    for more in ([], ["--chunk", 60]):
-        bounds = ["--bounds", "-1,-1,1,1", "--overwrite"]
-        status, out, _ = call(tmp_path / "all.npy", tmp_path / "out.npy", *settings, *bounds, *more)
-        assert (status, f"30 of {len(part)} points, " in out) == (0, True)
-        np.testing.assert_array_equal(np.load(tmp_path / "out.npy"), np.load(tmp_path / "want.npy"))
+    bounds = ["--bounds", "-1,-1,1,1"]
+    done(tmp_path / "part.npy", tmp_path / "expected.npy", *settings)
+
+    status, out, _ = call(tmp_path / "all.npy", tmp_path / "out.npy", *settings, *bounds, *chunk)
+
+    assert status == 0
+    assert f"30 of {is_inside.sum()} points, " in out
+    kept = np.load(tmp_path / "out.npy")
+    expected = np.load(tmp_path / "expected.npy")
+    np.testing.assert_array_equal(kept, expected)
 
 
 @pytest.mark.parametrize(
@@ -88,9 +114,13 @@ def test_unsupported_file_says_why(name, content, said, folder, tmp_path):
 
 
 def test_sampler_with_anchors_takes_whole_files_only(anchored, tmp_path):
-    path = tmp_path / "a.npy"
-    np.save(path, np.random.default_rng(1).normal(size=(90, 3)))
+    source = tmp_path / "a.npy"
+    points = np.random.default_rng(1).normal(size=(90, 3))
+    np.save(source, points)
     settings = ["--weights", anchored, "--readout", "matched", "--m", 20]
-    assert call(path, tmp_path / "out.npy", *settings)[0] == 0
+
+    done(source, tmp_path / "out.npy", *settings)
+    words = refused(source, tmp_path / "none.npy", *settings, "--chunk", 60)
+
     assert np.load(tmp_path / "out.npy").shape == (20, 3)
-    assert "anchors=fps" in refused(path, tmp_path / "none.npy", *settings, "--chunk", 60)
+    assert "anchors=fps" in words

@@ -33,38 +33,68 @@ def test_subset_distance_matches_kd_tree(clouds, rng):
     torch.testing.assert_close(got, torch.tensor(want, dtype=torch.float32))
 
 
-def test_unique_points_counts_each_match_or_index_once(clouds):
-    samples = torch.stack([clouds[:, 4], clouds[:, 4], clouds[:, 9] + 1e-4], 1)
-    got = values("matched/unique_points", clouds, SampleOutput(samples, None, {}))
-    assert got.tolist() == [2, 2, 2]
-    indices = torch.tensor([[0, 1, 1, 2]] * 3)
-    output = SampleOutput(clouds[:, indices[0]], indices, {})
-    assert values("matched/unique_points", clouds, output).tolist() == [3, 3, 3]
+def test_unique_points_counts_each_match_once(clouds):
+    near = clouds[:, 9] + 1e-4
+    samples = torch.stack([clouds[:, 4], clouds[:, 4], near], 1)
+    output = SampleOutput(samples, None, {})
+
+    numbers = values("matched/unique_points", clouds, output)
+
+    assert numbers.tolist() == [2, 2, 2]
 
 
-def test_matrix_metrics_match_ideal_and_uniform_matrix(clouds):
+def test_unique_points_counts_each_index_once(clouds):
+    rows = torch.tensor([0, 1, 1, 2])
+    output = SampleOutput(clouds[:, rows], rows.expand(3, 4), {})
+
+    numbers = values("matched/unique_points", clouds, output)
+
+    assert numbers.tolist() == [3, 3, 3]
+
+
+def output_of_matrix(clouds, queries, tau):
     keys = torch.eye(40).expand(3, 40, 40)
-    ideal = SamplingMatrix(torch.eye(40)[:5], keys, 1e-3)
-    uniform = SamplingMatrix(torch.zeros(5, 40), keys, 1.0)
-    samples = clouds[:, :5]
-    for matrix, percent, error in ((ideal, 100 / 40, 0.0), (uniform, 100.0, None)):
-        output = SampleOutput(samples, None, {}, matrix)
-        found = values("matrix/nonzero_percent", clouds, output)
-        assert found.tolist() == pytest.approx([percent] * 3)
-        # SᵀS of the uniform matrix is 1/40 everywhere.
-        want = error if error is not None else (5 * (1 - 1 / 40) ** 2 + 20 / 40**2) ** 0.5
-        got = values("matrix/orthogonality_error", clouds, output)
-        torch.testing.assert_close(got, torch.full((3,), want), atol=1e-5, rtol=1e-5)
+    matrix = SamplingMatrix(queries, keys, tau)
+    return SampleOutput(clouds[:, :5], None, {}, matrix)
+
+
+def test_matrix_metrics_match_ideal_matrix(clouds):
+    output = output_of_matrix(clouds, torch.eye(40)[:5], 1e-3)
+
+    percent = values("matrix/nonzero_percent", clouds, output)
+    error = values("matrix/orthogonality_error", clouds, output)
+
+    one_of_40 = 100 / 40
+    assert percent.tolist() == pytest.approx([one_of_40, one_of_40, one_of_40])
+    torch.testing.assert_close(error, torch.zeros(3), atol=1e-5, rtol=1e-5)
+
+
+def test_matrix_metrics_match_uniform_matrix(clouds):
+    output = output_of_matrix(clouds, torch.zeros(5, 40), 1.0)
+
+    percent = values("matrix/nonzero_percent", clouds, output)
+    error = values("matrix/orthogonality_error", clouds, output)
+
+    # SᵀS is 1/40 everywhere.
+    diagonal = 5 * (1 - 1 / 40) ** 2
+    off_diagonal = 20 / 40**2
+    expected = (diagonal + off_diagonal) ** 0.5
+    assert percent.tolist() == pytest.approx([100, 100, 100])
+    torch.testing.assert_close(error, torch.full((3,), expected), atol=1e-5, rtol=1e-5)
 
 
 def test_nonzero_percent_counts_each_column(clouds):
     # Column j of S has j + 1 equal entries.
     columns = 50 * torch.ones(5, 40).tril()
-    matrix = SamplingMatrix(columns, torch.eye(40).expand(3, 40, 40), 1.0)
-    output = SampleOutput(clouds[:, :5], None, {}, matrix)
-    found = SET_METRICS["matrix/nonzero_percent"].measure(clouds, output, (5, 2)) or {}
-    assert found[5].tolist() == pytest.approx([100 * (1 + 2 + 3 + 4 + 5) / 5 / 40] * 3)
-    assert found[2].tolist() == pytest.approx([100 * (1 + 2) / 2 / 40] * 3)
+    output = output_of_matrix(clouds, columns, 1.0)
+
+    percent = SET_METRICS["matrix/nonzero_percent"].measure(clouds, output, (5, 2))
+
+    assert percent is not None
+    of_five = 100 * (1 + 2 + 3 + 4 + 5) / 5 / 40
+    of_two = 100 * (1 + 2) / 2 / 40
+    assert percent[5].tolist() == pytest.approx([of_five, of_five, of_five])
+    assert percent[2].tolist() == pytest.approx([of_two, of_two, of_two])
 
 
 def test_set_metric_of_nan_is_nan():

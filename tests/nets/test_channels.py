@@ -39,16 +39,18 @@ WITH_NORMALS = PointChannels(
 def test_net_reads_every_channel_independent_of_order_and_batch(name, rng):
     net = NETS[name](2).eval()
     points = torch.randn(3, 40, 5, generator=rng, requires_grad=True)
+    order = torch.randperm(40, generator=rng)
 
     out = net(points)
+    in_order = net(points[:, order])
+    alone = net(points[1:2])
 
     (gradient,) = torch.autograd.grad(out.square().sum(), points)
-    assert (gradient.abs().sum((0, 1)) > 0).all()
-    torch.testing.assert_close(net(points[1:2]), out[1:2], atol=1e-5, rtol=1e-4)
-    order = torch.randperm(40, generator=rng)
-    permuted = net(points[:, order])
+    by_channel = gradient.abs().sum((0, 1))
+    assert (by_channel > 0).all()
+    torch.testing.assert_close(alone, out[1:2], atol=1e-5, rtol=1e-4)
     expected = out[:, order] if name == "segmentation" else out
-    torch.testing.assert_close(permuted, expected, atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(in_order, expected, atol=1e-5, rtol=1e-4)
 
 
 @pytest.mark.parametrize("name", NETS)
@@ -58,8 +60,9 @@ def test_weights_have_the_names_of_a_net_without_channels(name):
 
     assert list(default) == list(wider)
     different = [key for key in default if default[key].shape != wider[key].shape]
-    assert all(wider[key].shape[1] == default[key].shape[1] + 2 for key in different)
     assert different
+    for key in different:
+        assert wider[key].shape[1] == default[key].shape[1] + 2
 
 
 def test_dgcnn_finds_the_first_neighbours_by_coordinates(rng):
@@ -77,26 +80,29 @@ def test_dgcnn_finds_the_first_neighbours_by_coordinates(rng):
 def test_pcrnet_turns_normals_with_the_source(rng):
     torch.manual_seed(0)
     net = PCRNet(iterations=2, feature_channels=(8, 16), point_channels=WITH_NORMALS).eval()
+    net.motion.bias.data = torch.tensor([1.0, 0.5, 0, 0, 0.1, 0, 0])
     source = torch.randn(2, 30, 7, generator=rng)
     target = torch.randn(2, 30, 7, generator=rng)
-    net.motion.bias.data = torch.tensor([1.0, 0.5, 0, 0, 0.1, 0, 0])
 
     found = net(source, target)
 
     net.iterations = 1
     first = net(source, target)
-    second = net(move(source, first, WITH_NORMALS), target)
-    torch.testing.assert_close(found.translation, second.after(first).translation)
-    torch.testing.assert_close(found.quaternion, second.after(first).quaternion)
+    moved = move(source, first, WITH_NORMALS)
+    both = net(moved, target).after(first)
+    torch.testing.assert_close(found.translation, both.translation)
+    torch.testing.assert_close(found.quaternion, both.quaternion)
 
 
 def test_move_turns_normals_and_leaves_other_channels():
-    quarter = Motion(torch.tensor([[0.5**0.5, 0, 0, 0.5**0.5]]), torch.tensor([[5.0, 0, 0]]))
+    quarter_turn = torch.tensor([[0.5**0.5, 0, 0, 0.5**0.5]])
+    shift = torch.tensor([[5.0, 0, 0]])
     points = torch.tensor([[[1.0, 0, 0, 7.0, 1.0, 0, 0]]])
 
-    moved = move(points, quarter, WITH_NORMALS)
+    moved = move(points, Motion(quarter_turn, shift), WITH_NORMALS)
 
-    torch.testing.assert_close(moved, torch.tensor([[[5.0, 1.0, 0, 7.0, 0, 1.0, 0]]]))
+    expected = torch.tensor([[[5.0, 1.0, 0, 7.0, 0, 1.0, 0]]])
+    torch.testing.assert_close(moved, expected)
 
 
 def test_move_without_channels_is_the_motion(rng):

@@ -14,11 +14,26 @@ def net(**extra):
 
 
 def test_pcrnet_has_published_layers():
-    shapes = [tuple(m.weight.shape) for m in PCRNet().modules() if isinstance(m, torch.nn.Linear)]
-    points = [(64, 3), (64, 64), (64, 64), (128, 64), (1024, 128)]
-    head = [(1024, 2048), (1024, 1024), (512, 1024), (512, 512), (256, 512), (7, 256)]
-    assert sorted(shapes) == sorted(points + head)
-    assert not any(isinstance(m, torch.nn.BatchNorm1d) for m in PCRNet().modules())
+    net = PCRNet()
+
+    linear = [module for module in net.modules() if isinstance(module, torch.nn.Linear)]
+    norms = [module for module in net.modules() if isinstance(module, torch.nn.BatchNorm1d)]
+
+    shapes = [tuple(layer.weight.shape) for layer in linear]
+    assert sorted(shapes) == [
+        (7, 256),
+        (64, 3),
+        (64, 64),
+        (64, 64),
+        (128, 64),
+        (256, 512),
+        (512, 512),
+        (512, 1024),
+        (1024, 128),
+        (1024, 1024),
+        (1024, 2048),
+    ]
+    assert not norms
 
 
 def test_pcrnet_untrained_leaves_clouds_without_extent_as_they_are():
@@ -34,20 +49,25 @@ def test_pcrnet_untrained_leaves_clouds_without_extent_as_they_are():
 def test_pcrnet_is_independent_of_order_and_batch(iterations, rng):
     module = net(iterations=iterations)
     source, target = torch.randn(2, 4, 60, 3, generator=rng)
-    motion = module(source, target)
-    torch.testing.assert_close(motion.quaternion.norm(dim=1), torch.ones(4))
     order = torch.randperm(60, generator=rng)
-    shuffled = module(source[:, order], target[:, order.flip(0)])
-    torch.testing.assert_close(shuffled, motion, atol=1e-5, rtol=1e-5)
-    alone = module(source[1:2], target[1:2]).quaternion
-    torch.testing.assert_close(alone, motion.quaternion[1:2], atol=1e-5, rtol=1e-5)
-    assert module(source[:, :20], target).translation.shape == (4, 3)
+
+    motion = module(source, target)
+    in_order = module(source[:, order], target[:, order.flip(0)])
+    alone = module(source[1:2], target[1:2])
+    of_few_points = module(source[:, :20], target)
+
+    torch.testing.assert_close(motion.quaternion.norm(dim=1), torch.ones(4))
+    torch.testing.assert_close(in_order, motion, atol=1e-5, rtol=1e-5)
+    second = motion.quaternion[1:2]
+    torch.testing.assert_close(alone.quaternion, second, atol=1e-5, rtol=1e-5)
+    assert of_few_points.translation.shape == (4, 3)
 
 
 def homogeneous(motion):
     """The 4×4 matrices of motions, by SciPy."""
-    matrices = np.tile(np.eye(4), (len(motion.quaternion), 1, 1))
-    scalar_last = np.roll(motion.quaternion.detach().numpy(), -1, 1)
+    quaternion = motion.quaternion.detach().numpy()
+    scalar_last = np.roll(quaternion, -1, 1)
+    matrices = np.tile(np.eye(4), (len(quaternion), 1, 1))
     matrices[:, :3, :3] = Rotation.from_quat(scalar_last).as_matrix()
     matrices[:, :3, 3] = motion.translation.detach().numpy()
     return matrices
@@ -57,23 +77,30 @@ def test_pcrnet_pose_is_product_of_homogeneous_matrices(rng):
     source, target = torch.randn(2, 4, 60, 3, generator=rng)
     one = net()
     three = net(iterations=3)
+
+    motion = three(source, target)
+
     total = np.tile(np.eye(4), (4, 1, 1))
     moved = source
     for _ in range(3):
         step = homogeneous(one(moved, target))
         assert np.abs(step - np.eye(4)).max() > 0.1
         total = step @ total
-        rotated = source.numpy() @ total[:, :3, :3].swapaxes(1, 2) + total[:, None, :3, 3]
-        moved = torch.from_numpy(rotated).float()
-    np.testing.assert_allclose(homogeneous(three(source, target)), total, atol=1e-5)
+        rotation = total[:, :3, :3]
+        translation = total[:, None, :3, 3]
+        rotated = source.numpy() @ rotation.swapaxes(1, 2)
+        moved = torch.from_numpy(rotated + translation).float()
+    np.testing.assert_allclose(homogeneous(motion), total, atol=1e-5)
 
 
 def spread(module, rng):
     """Return the deviation of the last hidden layer between pairs, relative to its mean."""
     source, target = torch.randn(2, 16, 100, 3, generator=rng)
-    both = [module.pool(module.features(cloud)) for cloud in (source, target)]
-    hidden = module.head(torch.cat(both, 1))
-    return (hidden.std(0).mean() / hidden.abs().mean()).item()
+    of_source = module.pool(module.features(source))
+    of_target = module.pool(module.features(target))
+    hidden = module.head(torch.cat([of_source, of_target], 1))
+    deviation = hidden.std(0).mean()
+    return (deviation / hidden.abs().mean()).item()
 
 
 def test_pcrnet_initial_weights_keep_the_signal(rng):

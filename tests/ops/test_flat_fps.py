@@ -12,33 +12,64 @@ from mops_lightning.ops.flat_fps import fps
 def torch_cluster_fps(x, batch, ratio):
     """Choose farthest points as torch_cluster does: its loops, in plain torch."""
     chosen = []
-    for cloud in batch.unique().tolist():
-        rows = (batch == cloud).nonzero()[:, 0]
+    for cloud in batch.unique():
+        (rows,) = torch.where(batch == cloud)
         points = x[rows].view(len(rows), -1)
-        number = int((torch.tensor(float(len(rows))) * torch.tensor(ratio)).ceil())
-        picked, distances = [0], (points - points[0]).pow(2).sum(1)
+        size = torch.tensor(float(len(rows)))
+        number = int((size * torch.tensor(ratio)).ceil())
+        picked = [0]
+        distances = (points - points[0]).pow(2).sum(1)
         for _ in range(number - 1):
-            picked.append(int(distances.argmax()))
-            distances = distances.min((points - points[picked[-1]]).pow(2).sum(1))
+            farthest = int(distances.argmax())
+            picked.append(farthest)
+            to_farthest = (points - points[farthest]).pow(2).sum(1)
+            distances = distances.min(to_farthest)
         chosen.append(rows[picked])
     return torch.cat(chosen)
 
 
-@pytest.mark.parametrize("sizes", [(40,), (30, 30, 30), (50, 1, 0, 27)])
-@pytest.mark.parametrize(("ratio", "shape"), [(0.1, (3,)), (0.5, ()), (1.0, (2, 2)), (0.3, (7,))])
+@pytest.mark.parametrize(
+    "sizes",
+    [
+        (40,),
+        (30, 30, 30),
+        (50, 1, 0, 27),
+    ],
+)
+@pytest.mark.parametrize(
+    ("ratio", "shape"),
+    [
+        (0.1, (3,)),
+        (0.5, ()),
+        (1.0, (2, 2)),
+        (0.3, (7,)),
+    ],
+)
 def test_flat_fps_equals_torch_cluster(sizes, ratio, shape, rng):
-    batch = torch.arange(len(sizes)).repeat_interleave(torch.tensor(sizes))
+    number = len(sizes)
+    batch = torch.arange(number).repeat_interleave(torch.tensor(sizes))
     x = torch.randn(len(batch), *shape, generator=rng)
-    rows = fps(x, batch, ratio, random_start=False, batch_size=len(sizes) + 1)
+
+    rows = fps(x, batch, ratio, random_start=False, batch_size=number + 1)
+
     assert torch.equal(rows, torch_cluster_fps(x, batch, ratio))
-    if len(sizes) == 1:
-        assert torch.equal(rows, fps(x, ratio=ratio, random_start=False))
+    if number == 1:
+        without_batch = fps(x, ratio=ratio, random_start=False)
+        assert torch.equal(rows, without_batch)
 
 
 def test_ratio_of_each_cloud_is_its_own(rng):
-    x, batch = torch.rand(60, 3, generator=rng), torch.arange(2).repeat_interleave(30)
-    alone = [fps(x[i * 30 :][:30], None, r, False) + i * 30 for i, r in enumerate((0.1, 0.5))]
-    assert torch.equal(fps(x, batch, torch.tensor([0.1, 0.5]), False), torch.cat(alone))
+    first = torch.rand(30, 3, generator=rng)
+    second = torch.rand(30, 3, generator=rng)
+    x = torch.cat([first, second])
+    batch = torch.arange(2).repeat_interleave(30)
+    ratios = torch.tensor([0.1, 0.5])
+
+    rows = fps(x, batch, ratios, random_start=False)
+
+    of_first = fps(first, ratio=0.1, random_start=False)
+    of_second = fps(second, ratio=0.5, random_start=False)
+    assert torch.equal(rows, torch.cat([of_first, of_second + 30]))
 
 
 def test_random_start_differs_between_clouds_and_repeats_with_torch_seed():

@@ -55,11 +55,19 @@ def test_keep_spaced_is_spaced_and_covers(cloud, spacing):
 
 @pytest.mark.parametrize(("spacing", "number"), [(1e-300, 2), (1e300, 1)])
 def test_keep_spaced_square_of_spacing_beyond_float64(spacing, number):
-    points = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    points = np.array(
+        [
+            [0.0, 0.0, 0.0],
+            [5.0, 0.0, 0.0],
+            [0.0, 0.0, 0.0],
+        ]
+    )
 
     kept = keep_spaced(points, spacing)
 
-    assert len(np.unique(points[kept], axis=0)) == len(kept) == number
+    different = np.unique(points[kept], axis=0)
+    assert len(kept) == number
+    assert len(different) == number
 
 
 @pytest.mark.parametrize("cloud", CLOUDS)
@@ -84,18 +92,41 @@ def test_keep_spaced_of_copies_keeps_the_first_row():
     assert keep_spaced(points, 0.5).tolist() == [0, 1]
 
 
-def test_keep_spaced_prefers_heavy_points():
-    points = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.2, 0.0, 0.0]])
+@pytest.mark.parametrize(
+    ("weight", "expected"),
+    [
+        ([1.0, 2.0, 1.0], [1]),
+        ([2.0, 1.0, 2.0], [0, 2]),
+    ],
+)
+def test_keep_spaced_prefers_heavy_points(weight, expected):
+    points = np.array(
+        [
+            [0.0, 0.0, 0.0],
+            [0.1, 0.0, 0.0],
+            [0.2, 0.0, 0.0],
+        ]
+    )
 
-    assert keep_spaced(points, 0.15, weight=np.array([1.0, 2.0, 1.0])).tolist() == [1]
-    assert keep_spaced(points, 0.15, weight=np.array([2.0, 1.0, 2.0])).tolist() == [0, 2]
+    kept = keep_spaced(points, 0.15, weight=np.array(weight))
+
+    assert kept.tolist() == expected
 
 
 def test_priority_order_equal_hashes_are_ordered_by_coordinates_then_rows():
-    points = np.array([[3.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0], [1.0, 0, 0]])
+    points = np.array(
+        [
+            [3.0, 0.0, 0.0],
+            [1.0, 0.0, 0.0],
+            [2.0, 0.0, 0.0],
+            [1.0, 0.0, 0.0],
+        ]
+    )
     hashes = np.array([7, 7, 5, 7], np.uint64)
 
-    assert priority_order(points, hashes).tolist() == [2, 1, 3, 0]
+    order = priority_order(points, hashes)
+
+    assert order.tolist() == [2, 1, 3, 0]
 
 
 def test_priorities_of_zeros_do_not_depend_on_the_sign():

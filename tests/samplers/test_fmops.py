@@ -1,3 +1,4 @@
+import itertools
 import math
 
 import pytest
@@ -42,34 +43,56 @@ def drawn(number, m_max=512, **settings):
     return [net.training_sizes() for _ in range(number)]
 
 
-def test_training_sizes_have_documented_distribution():
-    uniform = torch.tensor(drawn(4000, size_sampling="uniform")).flatten().double()
-    assert (uniform.min(), uniform.max()) == (1, 512)
-    assert uniform.mean() == pytest.approx(256.5, rel=0.03)
-    log = torch.tensor(drawn(4000, num_sizes=1))
-    assert log.shape == (4000, 1)
-    assert log.min() == 1
-    assert 500 <= log.max() <= 512
+def test_uniform_training_sizes_have_documented_distribution():
+    sizes = torch.tensor(drawn(4000, size_sampling="uniform")).flatten().double()
+
+    assert sizes.min() == 1
+    assert sizes.max() == 512
+    assert sizes.mean() == pytest.approx(256.5, rel=0.03)
+
+
+def share(condition):
+    return condition.double().mean()
+
+
+def test_single_training_sizes_have_documented_distribution():
+    sizes = torch.tensor(drawn(4000, num_sizes=1))
+    sizes_up_to_3 = torch.tensor(drawn(4000, 3, num_sizes=1))
+
+    assert sizes.shape == (4000, 1)
+    assert sizes.min() == 1
+    assert 500 <= sizes.max() <= 512
     # floor(513^u) is m with the probability log((m + 1) / m) / log 513.
-    assert (log == 1).double().mean() == pytest.approx(0.1111, abs=0.02)
-    assert (log <= 22).double().mean() == pytest.approx(0.5025, abs=0.03)
-    few = torch.tensor(drawn(4000, 3, num_sizes=1))
-    assert (few == 3).double().mean() == pytest.approx(math.log(4 / 3, 4), abs=0.02)
-    nested = drawn(300, num_sizes=4)
-    assert all(list(sizes) == sorted(set(sizes)) for sizes in nested)
-    assert all(1 <= sizes[0] <= 4 and 107 <= sizes[-1] <= 512 for sizes in nested)
-    # Neighbouring parts share a size at their boundary, which is then drawn once.
-    assert {len(sizes) for sizes in nested} <= {3, 4}
+    assert share(sizes == 1) == pytest.approx(0.1111, abs=0.02)
+    assert share(sizes <= 22) == pytest.approx(0.5025, abs=0.03)
+    share_of_3 = math.log(4 / 3, 4)
+    assert share(sizes_up_to_3 == 3) == pytest.approx(share_of_3, abs=0.02)
+
+
+def test_nested_training_sizes_are_one_of_each_part():
+    for sizes in drawn(300, num_sizes=4):
+        assert list(sizes) == sorted(set(sizes))
+        assert 1 <= sizes[0] <= 4
+        assert 107 <= sizes[-1] <= 512
+        # Neighbouring parts share a size at their boundary, which is then drawn once.
+        assert len(sizes) in (3, 4)
+
+
+def different_sizes(steps):
+    return set(itertools.chain.from_iterable(steps))
 
 
 @pytest.mark.parametrize("size_sampling", ["uniform", "nested"])
 def test_training_sizes_begin_at_min_size(size_sampling):
-    sizes = drawn(2000, 32, size_sampling=size_sampling, num_sizes=2, min_size=8)
-    assert {size for step in sizes for size in step} == set(range(8, 33))
-    assert set(small(4, size_sampling=size_sampling, min_size=8).training_sizes()) == {4}
-    assert set(small(1, size_sampling=size_sampling).training_sizes()) == {1}
-    tiny = drawn(99, 3, size_sampling=size_sampling, num_sizes=1)
-    assert {size for step in tiny for size in step} <= {1, 2, 3}
+    steps = drawn(2000, 32, size_sampling=size_sampling, num_sizes=2, min_size=8)
+    below_min_size = small(4, size_sampling=size_sampling, min_size=8)
+    of_one_point = small(1, size_sampling=size_sampling)
+    of_three_points = drawn(99, 3, size_sampling=size_sampling, num_sizes=1)
+
+    assert different_sizes(steps) == set(range(8, 33))
+    assert set(below_min_size.training_sizes()) == {4}
+    assert set(of_one_point.training_sizes()) == {1}
+    assert different_sizes(of_three_points) <= {1, 2, 3}
 
 
 def test_nested_training_sizes_split_the_range_from_min_size():

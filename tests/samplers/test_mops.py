@@ -20,25 +20,32 @@ class PlainMOPS(nn.Module):
     def __init__(self, fast: MOPSNet) -> None:
         super().__init__()
         self.features = fast.features
-        local = fast.rho_local.weight.shape[1]
-        rho = linear_norm_relu([2 * local, *(m.out_features for m in self._linears(fast))])
-        rho[0].weight.data = torch.cat([fast.rho_local.weight, fast.rho_global.weight], 1).data
-        rho[1].load_state_dict(fast.rho_first[0].state_dict())
-        for number, layer in enumerate(fast.rho):
-            rho[3 + number].load_state_dict(layer.state_dict())
-        self.rho = rho
+        self.rho = self._joined_rho(fast)
         self.last = nn.Linear(fast.queries.weight.shape[1], fast.m)
         self.last.weight.data = fast.queries.weight.data
         self.tau = fast.tau
 
     @staticmethod
-    def _linears(fast):
-        return [fast.rho_local, *(m for m in fast.rho if isinstance(m, nn.Linear))]
+    def _joined_rho(fast):
+        """Return ρ with a first layer that reads local and global features side by side."""
+        channels = [2 * fast.rho_local.in_features, fast.rho_local.out_features]
+        for layer in fast.rho:
+            if isinstance(layer, nn.Linear):
+                channels.append(layer.out_features)
+        rho = linear_norm_relu(channels)
+        first = torch.cat([fast.rho_local.weight, fast.rho_global.weight], 1)
+        rho[0].weight.data = first.data
+        rho[1].load_state_dict(fast.rho_first[0].state_dict())
+        for number, layer in enumerate(fast.rho):
+            rho[3 + number].load_state_dict(layer.state_dict())
+        return rho
 
     def forward(self, points):
         local, global_ = self.features(points)
-        joined = torch.cat([local, global_[:, None].expand_as(local)], 2)
-        preliminary = self.last(self.rho(joined.flatten(0, 1))).unflatten(0, points.shape[:2])
+        repeated = global_[:, None].expand_as(local)
+        joined = torch.cat([local, repeated], 2)
+        flat = self.last(self.rho(joined.flatten(0, 1)))
+        preliminary = flat.unflatten(0, points.shape[:2])
         matrix = (preliminary / self.tau).softmax(1)
         return matrix, matrix.mT @ points
 
@@ -48,25 +55,42 @@ def test_mops_equals_published_form(training, rng):
     fast = small(tau_min=0.3).double().train(training)
     plain = PlainMOPS(fast).double().train(training)
     points = torch.randn(3, 20, 3, dtype=torch.float64, generator=rng, requires_grad=True)
-    matrix, sampled = plain(points)
+    direction = torch.randn(3, 5, 3, dtype=torch.float64, generator=rng)
+
     output = fast(points)
+
+    matrix, sampled = plain(points)
     # The plain twin has a bias in its last layer, which the softmax must cancel.
     assert plain.last.bias.abs().min() > 0
     torch.testing.assert_close(output.points, sampled)
     torch.testing.assert_close(output.matrix.dense(), matrix)
-    weights = torch.randn(3, 5, 3, dtype=torch.float64, generator=rng)
     shared = [points, *fast.features.parameters()]
-    got = torch.autograd.grad((output.points * weights).sum(), [*shared, fast.queries.weight])
-    want = torch.autograd.grad((sampled * weights).sum(), [*shared, plain.last.weight])
-    assert all(gradient.abs().max() > 0 for gradient in want[:2])
-    torch.testing.assert_close(got, want)
+    along = (output.points * direction).sum()
+    gradients = torch.autograd.grad(along, [*shared, fast.queries.weight])
+    plain_along = (sampled * direction).sum()
+    expected = torch.autograd.grad(plain_along, [*shared, plain.last.weight])
+    assert expected[0].abs().max() > 0
+    assert expected[1].abs().max() > 0
+    torch.testing.assert_close(gradients, expected)
 
 
 def test_mops_has_published_layers():
     net = MOPSNet(32)
-    sizes = [tuple(p.shape) for name, p in net.named_parameters() if p.ndim == 2]
-    features = [(64, 3), (64, 64), (64, 64), (128, 64), (128, 128)]
-    assert sizes == [*features, (512, 128), (512, 128), (256, 512), (128, 256), (32, 128)]
+
+    sizes = [tuple(weights.shape) for weights in net.parameters() if weights.ndim == 2]
+
+    assert sizes == [
+        (64, 3),
+        (64, 64),
+        (64, 64),
+        (128, 64),
+        (128, 128),
+        (512, 128),
+        (512, 128),
+        (256, 512),
+        (128, 256),
+        (32, 128),
+    ]
 
 
 def test_tau_decreases_exponentially_and_is_tau_min_in_evaluation():
@@ -90,22 +114,30 @@ def test_mops_loss_is_weighted_and_in_training_only(rng):
 
 def test_mops_overlap_adds_weighted_penalty(rng):
     points = torch.randn(3, 40, 3, generator=rng)
-    plain, net = small().train(), small(overlap=4.0).train()
-    assert set(plain(points).losses) == {"subset"}
+    without = small().train()
+    net = small(overlap=4.0).train()
+
+    losses_without = without(points).losses
     output = net(points)
-    assert output.losses["subset"] == plain(points).losses["subset"]
-    expected = 4 * overlap_losses(output.matrix, (5,))[5]
-    torch.testing.assert_close(output.losses["overlap"], expected)
+
+    assert set(losses_without) == {"subset"}
+    assert output.losses["subset"] == losses_without["subset"]
+    penalties = overlap_losses(output.matrix, (5,))
+    torch.testing.assert_close(output.losses["overlap"], 4 * penalties[5])
 
 
 def test_mops_threshold_drops_small_entries_in_evaluation_only(rng):
     points = torch.randn(2, 20, 3, generator=rng)
-    net, dense = small(tau_min=0.02, threshold=0.05), small(tau_min=0.02)
-    torch.testing.assert_close(net.train()(points).points, dense.train()(points).points)
-    output = net.eval()(points)
-    matrix = output.matrix.dense()
-    kept = matrix * (matrix >= 0.05)
+    net = small(tau_min=0.02, threshold=0.05).train()
+    without = small(tau_min=0.02).train()
+
+    in_training = net(points)
+    in_evaluation = net.eval()(points)
+
+    torch.testing.assert_close(in_training.points, without(points).points)
+    matrix = in_evaluation.matrix.dense()
+    kept = matrix.where(matrix >= 0.05, 0.0)
     assert (kept > 0).any(1).all()
     assert (kept == 0).any()
-    kept = kept / kept.sum(1, keepdim=True)
-    torch.testing.assert_close(output.points, kept.mT @ points)
+    renormalised = kept / kept.sum(1, keepdim=True)
+    torch.testing.assert_close(in_evaluation.points, renormalised.mT @ points)

@@ -53,7 +53,7 @@ def in_steps(points, m, weight=None):
     scale = 2.0 ** min(50, 62 - number.bit_length())
 
     def weights(cloud, bound, others):
-        squared = 0
+        squared = torch.zeros((), dtype=torch.float64)
         for axis in range(others.shape[-1]):
             difference = cloud[..., axis] - others[..., axis]
             squared = squared + difference**2

@@ -8,11 +8,15 @@ from mops_lightning.samplers.voxel import BISECTIONS, COARSEST, FINEST, VoxelSam
 
 def plain_voxels(cloud, level):
     """Return the points of every voxel, with 2^level voxels along the longest side."""
-    low = [min(p[k] for p in cloud) for k in range(3)]
-    side = max(max(p[k] for p in cloud) - low[k] for k in range(3))
+    axes = list(zip(*cloud, strict=True))
+    low = [min(axis) for axis in axes]
+    side = max(max(axis) - min(axis) for axis in axes)
     voxels = defaultdict(list)
-    for index, p in enumerate(cloud):
-        voxels[tuple(int((p[k] - low[k]) / side * 2**level) for k in range(3))].append(index)
+    for row, point in enumerate(cloud):
+        cell = []
+        for coordinate, least in zip(point, low, strict=True):
+            cell.append(int((coordinate - least) / side * 2**level))
+        voxels[tuple(cell)].append(row)
     return voxels
 
 
@@ -30,40 +34,47 @@ def plain_choice(cloud, m):
     return [voxels[cell] for cell in ranked[:m]]
 
 
+def assert_nearest_to_mean(row, cloud, voxel, tolerance=0.0):
+    """Assert that a row is a point of a voxel, and the nearest to the mean of its points."""
+    points = cloud[voxel]
+    distances = (points - points.mean(0)).norm(dim=1)
+    assert row in voxel
+    distance = distances[voxel.index(row)]
+    assert distance <= distances.min() * (1 + 1e-6) + tolerance
+
+
 @pytest.mark.parametrize("m", [2, 13, 60])
 def test_voxel_equals_plain_search(m, rng):
     points = torch.randn(3, 100, 3, dtype=torch.float64, generator=rng)
+
     picked = VoxelSampler(m)(points)
-    for b in range(3):
-        members = plain_choice(points[b].tolist(), m)
-        for slot, voxel in enumerate(members):
-            mean = points[b][voxel].mean(0)
-            index = int(picked.indices[b, slot])
-            distances = (points[b][voxel] - mean).norm(dim=1)
-            assert index in voxel
-            assert distances[voxel.index(index)] <= distances.min() * (1 + 1e-6)
+
+    for cloud, rows in zip(points, picked.indices.tolist(), strict=True):
+        voxels = plain_choice(cloud.tolist(), m)
+        for slot, voxel in enumerate(voxels):
+            assert_nearest_to_mean(rows[slot], cloud, voxel)
 
 
 @pytest.mark.parametrize("name", ["clusters", "grid", "map"])
 def test_fullest_voxels_equal_plain_search(name, rng):
     """Most positions settle in their voxels long before the last step."""
     points = torch.randn(1, 900, 3, dtype=torch.float64, generator=rng)
+    spread = torch.rand(1, 900, 1, dtype=torch.float64, generator=rng) ** 4
+    size = torch.tensor([90.0, 40.0, 3.0])
+    origin = torch.tensor([637e3, 851e3, 412.0])
     clouds = {
-        "clusters": points * torch.rand(1, 900, 1, dtype=torch.float64, generator=rng) ** 4,
+        "clusters": points * spread,
         "grid": (points * 8).round() / 8,  # positions on the faces of voxels, and copies
-        "map": points * torch.tensor([90.0, 40.0, 3.0]) + torch.tensor([637e3, 851e3, 412.0]),
+        "map": points * size + origin,
     }
     cloud = clouds[name]
 
     rows = fullest_voxels(cloud, 300)[0].tolist()
 
-    members = plain_choice(cloud[0].tolist(), 300)
+    voxels = plain_choice(cloud[0].tolist(), 300)
     assert len(rows) >= 300
-    for row, voxel in zip(rows, members, strict=False):
-        mean = cloud[0][voxel].mean(0)
-        distances = (cloud[0][voxel] - mean).norm(dim=1)
-        assert row in voxel
-        assert distances[voxel.index(row)] <= distances.min() * (1 + 1e-6) + 1e-9
+    for row, voxel in zip(rows, voxels, strict=False):
+        assert_nearest_to_mean(row, cloud[0], voxel, tolerance=1e-9)
 
 
 def test_voxel_single_voxel_holds_all_points(rng):
@@ -84,10 +95,18 @@ def test_fullest_voxels_outlier_leaves_enough_voxels(rng):
 
 
 def test_voxel_fills_up_coincident_points():
-    places = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [0.0, 1.0, 0]])
-    points = places.repeat_interleave(torch.tensor([5, 4, 3]), 0)[None]
-    output = VoxelSampler(7)(points)
-    assert output.points[0, :3].tolist() == places.tolist()  # in order of decreasing population
-    rows = {tuple(p) for p in output.points[0].tolist()}
-    assert rows == {tuple(p) for p in places.tolist()}
-    assert len(set(output.indices[0].tolist())) == 7
+    places = torch.tensor(
+        [
+            [0.0, 0.0, 0.0],
+            [1.0, 0.0, 0.0],
+            [0.0, 1.0, 0.0],
+        ]
+    )
+    points = places.repeat_interleave(torch.tensor([5, 4, 3]), 0)
+
+    output = VoxelSampler(7)(points[None])
+
+    (sampled,) = output.points
+    assert torch.equal(sampled[:3], places)  # in order of decreasing population
+    assert torch.equal(sampled.unique(dim=0), places.unique(dim=0))
+    assert len(output.indices.unique()) == 7

@@ -1,5 +1,6 @@
 """Tasks on points with channels beside x, y and z."""
 
+import pytest
 import torch
 from torch.nn import functional as F
 
@@ -7,7 +8,7 @@ from mops_lightning.channels import Channel, PointChannels
 from mops_lightning.nets.autoencoder import AutoEncoder
 from mops_lightning.nets.hierarchical import HierarchicalSegmentation
 from mops_lightning.nets.pcrnet import PCRNet
-from mops_lightning.ops.rigid import Motion, quaternion_to_matrix
+from mops_lightning.ops.rigid import quaternion_to_matrix
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.tasks.reconstruction import Reconstruction
 from mops_lightning.tasks.registration import Registration
@@ -15,59 +16,96 @@ from mops_lightning.tasks.segmentation import Segmentation
 from mops_lightning.types import Batch
 
 WITH_NORMALS = PointChannels(
-    (Channel("intensity"), Channel("normal_x"), Channel("normal_y"), Channel("normal_z"))
+    (
+        Channel("intensity"),
+        Channel("normal_x"),
+        Channel("normal_y"),
+        Channel("normal_z"),
+    )
 )
 
 
-def test_pairs_turn_normals_with_the_target_and_centre_coordinates_only(rng):
-    points = torch.randn(2, 30, 7, generator=rng)
-    points[..., 4:] = F.normalize(points[..., 4:], dim=2)
+@pytest.fixture
+def clouds_with_normals(rng):
+    clouds = torch.randn(2, 30, 7, generator=rng)
+    clouds[..., 4:] = F.normalize(clouds[..., 4:], dim=2)
+    return clouds
+
+
+def registration():
     net = PCRNet(feature_channels=(8, 16), point_channels=WITH_NORMALS)
-    task = Registration(net, point_channels=WITH_NORMALS)
+    return Registration(net, point_channels=WITH_NORMALS)
+
+
+def generators():
+    return [torch.Generator().manual_seed(0), torch.Generator().manual_seed(1)]
+
+
+def test_pairs_have_the_coordinates_of_pairs_without_channels(clouds_with_normals):
     without = Registration(PCRNet(feature_channels=(8, 16)))
-    seeds = [torch.Generator().manual_seed(seed) for seed in (0, 1)]
-    same_seeds = [torch.Generator().manual_seed(seed) for seed in (0, 1)]
+    coordinates = clouds_with_normals[..., :3].contiguous()
 
-    batch = task.make_batch(points, seeds)
+    batch = registration().make_batch(clouds_with_normals, generators())
 
-    expected = without.make_batch(points[..., :3].contiguous(), same_seeds)
+    expected = without.make_batch(coordinates, generators())
     torch.testing.assert_close(batch.points[..., :3], expected.points)
     torch.testing.assert_close(batch.centroids, expected.centroids)
+
+
+def test_pairs_turn_normals_with_the_target(clouds_with_normals):
+    batch = registration().make_batch(clouds_with_normals, generators())
+
     source, target = batch.points.chunk(2)
-    rotation = quaternion_to_matrix(Motion(batch.quaternion, batch.translation).quaternion)
-    assert torch.equal(source[..., 3:], points[..., 3:])
-    assert torch.equal(target[..., 3], points[..., 3])
-    torch.testing.assert_close(target[..., 4:], points[..., 4:] @ rotation.mT)
+    rotation = quaternion_to_matrix(batch.quaternion)
+    turned_normals = clouds_with_normals[..., 4:] @ rotation.mT
+    assert torch.equal(source[..., 3:], clouds_with_normals[..., 3:])
+    assert torch.equal(target[..., 3], clouds_with_normals[..., 3])
+    torch.testing.assert_close(target[..., 4:], turned_normals)
+
+
+def test_registration_with_channels_has_finite_losses(clouds_with_normals):
+    task = registration()
+    batch = task.make_batch(clouds_with_normals, generators())
+
     losses = task.step(batch, batch.points[:, :9]).losses
-    assert all(loss.isfinite() for loss in losses.values())
+
+    assert losses
+    for loss in losses.values():
+        assert loss.isfinite()
 
 
 def test_reconstruction_compares_coordinates(rng):
     points = torch.randn(2, 40, 5, generator=rng)
-    task = Reconstruction(AutoEncoder(40, 16, (8, 8), point_channels=2), exact_up_to=None).eval()
+    other_channels = points.clone()
+    other_channels[..., 3:] *= -1
+    net = AutoEncoder(40, 16, (8, 8), point_channels=2)
+    task = Reconstruction(net, exact_up_to=None).eval()
     batch = Batch(points, torch.zeros(2, dtype=torch.int64))
-    other_channels = batch._replace(points=torch.cat([points[..., :3], -points[..., 3:]], 2))
+    batch_of_others = batch._replace(points=other_channels)
     sample = points[:, :9]
 
     step = task.step(batch, sample)
-    scores = task.scores(batch, {"first": sample})["first"]
+    step_of_others = task.step(batch_of_others, sample)
+    scores = task.scores(batch, {"first": sample})
 
     assert step.output.shape == (2, 40, 3)
-    torch.testing.assert_close(step.losses, task.step(other_channels, sample).losses)
-    torch.testing.assert_close(scores.losses["chamfer"], step.losses["chamfer"])
+    torch.testing.assert_close(step.losses, step_of_others.losses)
+    torch.testing.assert_close(scores["first"].losses["chamfer"], step.losses["chamfer"])
 
 
 def test_segmentation_interpolates_by_coordinates(rng):
     points = torch.randn(2, 40, 4, generator=rng)
+    scaled = points.clone()
+    scaled[..., 3] *= 100
     net = HierarchicalSegmentation(3, FPSSampler, (20, 8), (8, 16, 16), 4, point_channels=1)
     task = Segmentation(net, 3).eval()
     parts = torch.zeros(2, 40, dtype=torch.int64)
     batch = Batch(points, torch.zeros(2, dtype=torch.int64), parts=parts)
-    scaled = points.clone()
-    scaled[..., 3] *= 100
+    batch_of_scaled = batch._replace(points=scaled)
     sample = points[:, :9]
 
-    result = task.predict(batch, sample)
+    logits = task.predict(batch, sample)
+    logits_of_scaled = task.predict(batch_of_scaled, sample)
 
-    assert result.shape == (2, 40, 3)
-    torch.testing.assert_close(result, task.predict(batch._replace(points=scaled), sample))
+    assert logits.shape == (2, 40, 3)
+    torch.testing.assert_close(logits, logits_of_scaled)

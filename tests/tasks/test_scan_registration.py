@@ -31,13 +31,15 @@ def test_halves_share_no_point_and_target_is_moved(clouds):
     batch = batch_of(clouds)
 
     source, target = batch.points.chunk(2)
+    translation = batch.translation[:, None]
     motion = Motion(batch.quaternion, batch.translation)
-    back = torch.linalg.inv(motion.apply(torch.eye(3).expand(3, 3, 3)) - batch.translation[:, None])
-    original = (target - batch.translation[:, None]) @ back
-    together = torch.cat([source, original], 1)
+    axes = torch.eye(3).expand(3, 3, 3)
+    rotation = motion.apply(axes) - translation
+    target_before = (target - translation) @ torch.linalg.inv(rotation)
+    together = torch.cat([source, target_before], 1)
     for found, cloud in zip(together, clouds, strict=True):
-        distance, rows = cKDTree(cloud).query(found)
-        assert np.max(distance) < 1e-5
+        distances, rows = cKDTree(cloud).query(found)
+        assert np.max(distances) < 1e-5
         assert np.sort(rows).tolist() == list(range(400))
 
 
@@ -69,19 +71,27 @@ def test_sample_of_the_target_is_not_used(clouds):
     assert torch.equal(found.quaternion, expected.quaternion)
 
 
+def plain_residuals(source, target):
+    """Return the distances to the planes of the nearest points, cut off at 0.3."""
+    distances, rows = cKDTree(target).query(source)
+    apart = (source - target[rows]).double()
+    normals = surface_normals(target[None])[0][rows].double()
+    residuals = (apart * normals).sum(1).abs()
+    residuals[torch.from_numpy(distances) > 0.3] = 0.3
+    return residuals
+
+
 def test_residuals_without_motion_equal_a_plain_form(clouds):
     batch = batch_of(clouds)
-    found = task().residuals(batch)
+
+    residuals = task().residuals(batch)
 
     source, target = batch.points.chunk(2)
     aligned = Motion(batch.quaternion, batch.translation).apply(source)
-    normals = surface_normals(target)
     for number in range(3):
-        distance, rows = cKDTree(target[number]).query(aligned[number])
-        apart = (aligned[number] - target[number][rows]).double()
-        plain = (apart * normals[number][rows].double()).sum(1).abs()
-        plain[torch.from_numpy(distance) > 0.3] = 0.3
-        torch.testing.assert_close(found[number, 0].double(), plain, atol=1e-5, rtol=0)
+        expected = plain_residuals(aligned[number], target[number])
+        found = residuals[number, 0].double()
+        torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
 
 
 def test_loss_is_smallest_at_the_mean_residual(clouds):
@@ -116,9 +126,14 @@ def test_clouds_of_one_point_and_wrong_limits_raise(clouds):
 
 
 def test_rotation_vectors_turn_as_scipys():
-    turn = torch.tensor([[0.0, 0.0, 0.0], [1e-8, 0.0, 0.0], [0.3, -2.0, 1.0]], dtype=torch.float64)
+    none = [0.0, 0.0, 0.0]
+    tiny = [1e-8, 0.0, 0.0]
+    large = [0.3, -2.0, 1.0]
+    vectors = torch.tensor([none, tiny, large], dtype=torch.float64)
+    translation = torch.zeros(3, 3, dtype=torch.float64)
 
-    found = motion_of_vectors(turn, torch.zeros(3, 3, dtype=torch.float64)).quaternion
+    motion = motion_of_vectors(vectors, translation)
 
-    expected = Rotation.from_rotvec(turn.numpy()).as_quat(scalar_first=True)
-    assert found.numpy() == pytest.approx(expected, abs=1e-12)
+    rotation = Rotation.from_rotvec(vectors.numpy())
+    expected = rotation.as_quat(scalar_first=True)
+    assert motion.quaternion.numpy() == pytest.approx(expected, abs=1e-12)

@@ -12,14 +12,17 @@ def test_cushion_has_size_and_volume():
     y = 1.0 - 2 * radius
     z = 1.5 - 2 * radius
     core = x * y * z
-    sides = 2 * radius * (x * y + y * z + z * x)
+    faces = x * y + y * z + z * x
+    sides = 2 * radius * faces
     edges = np.pi * radius**2 * (x + y + z)
     corners = 4 / 3 * np.pi * radius**3
     volume = core + sides + edges + corners
 
     mesh = mesh_parts.cushion((0, 2.0), (0, 1.0), (0, 1.5), radius)
 
-    assert np.allclose(mesh.bounds, [(0, 0, 0), (2.0, 1.0, 1.5)])
+    low, high = mesh.bounds
+    assert np.allclose(low, (0, 0, 0))
+    assert np.allclose(high, (2.0, 1.0, 1.5))
     assert 0.9 * volume < mesh.volume < volume
 
 
@@ -37,11 +40,14 @@ def test_rod_of_four_sections_fills_its_square():
 
 def test_tube_has_volume_of_a_torus():
     turn = np.linspace(0, 2 * np.pi, 65)
-    circle = np.column_stack((np.cos(turn), np.zeros(65), np.sin(turn)))
+    circle = np.zeros((65, 3))
+    circle[:, 0] = np.cos(turn)
+    circle[:, 2] = np.sin(turn)
 
     torus = mesh_parts.tube(circle, 0.1, sections=32, across=(0, 1, 0))
 
-    assert abs(torus.volume) == pytest.approx(2 * np.pi**2 * 0.01, rel=0.02)
+    expected = 2 * np.pi**2 * 0.01
+    assert abs(torus.volume) == pytest.approx(expected, rel=0.02)
 
 
 def test_box_fills_spans():
@@ -68,11 +74,15 @@ def test_turned_is_surface_of_revolution():
 
 
 def test_smooth_interpolates_without_overshoot():
-    curve = mesh_parts.smooth([(1, 0), (3, 1), (0.5, 2)], steps=50)
+    corners = [(1, 0), (3, 1), (0.5, 2)]
 
-    assert np.allclose(curve[[0, -1]], [(1, 0), (0.5, 2)])
-    assert curve[:, 0].min() >= 0.5
-    assert curve[:, 0].max() <= 3
+    curve = mesh_parts.smooth(corners, steps=50)
+
+    assert np.allclose(curve[0], (1, 0))
+    assert np.allclose(curve[-1], (0.5, 2))
+    radii = curve[:, 0]
+    assert radii.min() >= 0.5
+    assert radii.max() <= 3
 
 
 def test_join_keeps_all_faces():

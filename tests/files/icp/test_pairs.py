@@ -13,23 +13,28 @@ SCAN = Path("scan.ply")
 
 
 def test_halves_of_crops_share_no_point_and_fill_the_unit_sphere():
-    points = np.random.default_rng(0).uniform(-9, 9, (500, 3)) + np.array([4e5, 5e6, 0])
+    unit = np.random.default_rng(0).uniform(-9, 9, (500, 3))
+    points = unit + np.array([4e5, 5e6, 0])
 
     pairs = crop_pairs([(SCAN, points)], 100, 3, seed=0)
 
     assert len(pairs) == 3
     for pair in pairs:
-        both = np.concatenate([pair.source, pair.target])
-        assert pair.source.shape == pair.target.shape == (50, 3)
-        assert len(np.unique(both, axis=0)) == 100
-        assert np.linalg.norm(both, axis=1).max() == pytest.approx(1)
+        assert pair.source.shape == (50, 3)
+        assert pair.target.shape == (50, 3)
+        together = np.concatenate([pair.source, pair.target])
+        assert len(np.unique(together, axis=0)) == 100
+        radii = np.linalg.norm(together, axis=1)
+        assert radii.max() == pytest.approx(1)
         assert pair.truth.tolist() == np.eye(4).tolist()
 
 
 def test_crops_depend_on_the_seed_alone():
     points = np.random.default_rng(0).normal(size=(500, 3))
 
-    first, again, other = (crop_pairs([(SCAN, points)], 100, 2, seed)[1] for seed in (0, 0, 1))
+    _, first = crop_pairs([(SCAN, points)], 100, 2, seed=0)
+    _, again = crop_pairs([(SCAN, points)], 100, 2, seed=0)
+    _, other = crop_pairs([(SCAN, points)], 100, 2, seed=1)
 
     assert first.source.tolist() == again.source.tolist()
     assert first.source.tolist() != other.source.tolist()
@@ -41,17 +46,26 @@ def test_crops_name_a_scan_of_too_few_points():
 
 
 def test_frames_are_aligned_to_the_one_before(tmp_path):
-    place = np.random.default_rng(0).normal(size=(20, 3))
     poses = tmp_path / "poses.txt"
     poses.write_text("1 0 0 1 0 1 0 0 0 0 1 0\n0 -1 0 3 1 0 0 0 0 0 1 0\n")
-    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    frames = [(Path("0.ply"), place - [1, 0, 0]), (Path("1.ply"), (place - [3, 0, 0]) @ turn)]
+    quarter_turn = np.array(
+        [
+            [0.0, -1.0, 0.0],
+            [1.0, 0.0, 0.0],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+    room = np.random.default_rng(0).normal(size=(20, 3))
+    first = room - [1, 0, 0]
+    second = (room - [3, 0, 0]) @ quarter_turn
+    frames = [(Path("0.ply"), first), (Path("1.ply"), second)]
 
-    pairs = frame_pairs(frames, poses)
+    (pair,) = frame_pairs(frames, poses)
 
-    assert len(pairs) == 1
-    moved = pairs[0].source @ pairs[0].truth[:3, :3].T + pairs[0].truth[:3, 3]
-    assert moved == pytest.approx(pairs[0].target)
+    rotation = pair.truth[:3, :3]
+    translation = pair.truth[:3, 3]
+    moved = pair.source @ rotation.T + translation
+    assert moved == pytest.approx(pair.target)
 
 
 def test_frames_need_a_pose_each(tmp_path):
@@ -63,14 +77,20 @@ def test_frames_need_a_pose_each(tmp_path):
 
 
 def test_starts_are_within_the_angle_and_shift_about_the_mean_of_the_source():
-    pair = crop_pairs([(SCAN, np.random.default_rng(0).normal(size=(300, 3)))], 100, 1, 0)[0]
+    points = np.random.default_rng(0).normal(size=(300, 3))
+    (pair,) = crop_pairs([(SCAN, points)], 100, 1, 0)
 
-    starts = draw_motions([pair], 200, angle=15.0, shift=0.1, seed=0)[0]
+    (starts,) = draw_motions([pair], 200, angle=15.0, shift=0.1, seed=0)
 
     centre = pair.source.mean(0)
-    angles = [np.degrees(Rotation.from_matrix(s[:3, :3]).magnitude()) for s in starts]
-    shifts = [np.linalg.norm(s[:3, :3] @ centre + s[:3, 3] - centre) for s in starts]
-    assert 14 < max(angles) <= 15
+    angles = []
+    shifts = []
+    for start in starts:
+        rotation = start[:3, :3]
+        moved_centre = rotation @ centre + start[:3, 3]
+        angles.append(Rotation.from_matrix(rotation).magnitude())
+        shifts.append(np.linalg.norm(moved_centre - centre))
+    assert 14 < np.degrees(max(angles)) <= 15
     assert 0.09 < max(shifts) <= 0.1
 
 
