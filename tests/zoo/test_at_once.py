@@ -7,61 +7,45 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import pytest
 import torch
 
 from mops_lightning import MOPSNet, Sampler, SNet, downsample, load
 from mops_lightning.zoo import weights
+from tests.support.calls_at_once import digest
 
 MODELS = ("mops.modelnet40-m32", "snet.modelnet40-m32")
 
-CALLS = """
-import hashlib, sys, threading
-from concurrent.futures import ThreadPoolExecutor
-
-import torch
-
-from mops_lightning import downsample
-
-METHODS = ("mops.modelnet40-m32", "fps", "snet.modelnet40-m32", "fmops.modelnet40-m512", "serial")
-threads, calls = int(sys.argv[1]), int(sys.argv[2])
-torch.set_num_threads(1)
-all_ready = threading.Barrier(threads)
+ROOT = Path(__file__).parents[2]
 
 
-def call(number):
-    if number < threads:
-        all_ready.wait()
-    cloud = torch.rand(200, 3, generator=torch.Generator().manual_seed(number))
-    points, rows = downsample(cloud, 32, METHODS[number % len(METHODS)])
-    return points, rows
+@pytest.fixture
+def one_thread():
+    """Let torch use one thread, as each process that the test starts does."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
-before = torch.get_rng_state()
-with ThreadPoolExecutor(threads) as pool:
-    results = list(pool.map(call, range(calls)))
-assert torch.equal(torch.get_rng_state(), before)
-digest = hashlib.sha256()
-for points, rows in results:
-    digest.update(points.numpy().tobytes() + rows.numpy().tobytes())
-print(digest.hexdigest())
-"""
-
-
-def digest(threads: int, calls: int, cache: str) -> str:
+def digest_of_a_process(cache: str) -> str:
+    """Return the digest of 200 calls by 20 threads of a new process."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_CACHE_DIR": cache}
-    command = [sys.executable, "-W", "error", "-c", CALLS, str(threads), str(calls)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    command = [sys.executable, "-W", "error", "-m", "tests.support.calls_at_once", "20", "200"]
+    done = subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=600
+    )
     assert done.returncode == 0, done.stderr
-    return done.stdout
+    return done.stdout.strip()
 
 
-def test_downsample_200_calls_in_threads_of_two_processes_equal_serial_calls(tmp_path):
+def test_downsample_200_calls_in_threads_of_two_processes_equal_serial_calls(tmp_path, one_thread):
     cache = str(tmp_path)  # empty: first calls compile loops
 
     with ThreadPoolExecutor(2) as pool:
-        at_once = list(pool.map(lambda _: digest(20, 200, cache), range(2)))
+        at_once = list(pool.map(digest_of_a_process, [cache, cache]))
 
-    assert at_once == [digest(1, 200, cache)] * 2
+    assert at_once == [digest(1, 200)] * 2
 
 
 def build_own_net(_: int) -> int:
