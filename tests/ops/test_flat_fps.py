@@ -82,6 +82,18 @@ def test_random_start_differs_between_clouds_and_repeats_with_torch_seed():
     assert torch.equal(fps(x, batch, 0.01), starts)
 
 
+def test_random_start_of_a_large_cloud_beside_small_ones_may_be_any_of_its_points():
+    sizes = [2] + [1000] * 8
+    batch = torch.arange(9).repeat_interleave(torch.tensor(sizes))
+    x = torch.rand(len(batch), 3)
+    torch.manual_seed(0)
+
+    starts = fps(x, batch, 0.001)
+
+    rows_in_clouds = (starts[1:] - 2) % 1000
+    assert rows_in_clouds.min() < 500 < rows_in_clouds.max()
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

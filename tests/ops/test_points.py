@@ -1,7 +1,8 @@
+import numpy as np
 import pytest
 import torch
 
-from mops_lightning.ops.points import gather_points, normalize_unit_sphere
+from mops_lightning.ops.points import UnitSphere, gather_points, normalize_unit_sphere
 
 
 def test_gather_points_equals_double_loop(rng):
@@ -35,3 +36,18 @@ def test_normalize_of_coincident_points_is_zero():
     assert (result[0] == 0).all()
     (gradient,) = torch.autograd.grad(result.square().sum(), points)
     assert torch.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize("farthest", [0, 20_000, 39_999])
+def test_unit_sphere_of_a_large_cloud_reaches_its_farthest_point_wherever_it_is(farthest):
+    points = np.random.default_rng(0).uniform(-1, 1, (40_000, 3))
+    points += (500_000, 4_500_000, 100)
+    points[farthest] += 30
+
+    sphere = UnitSphere.around(points)
+
+    unit = sphere.normalise(points)
+    lengths = np.linalg.norm(unit, axis=1)
+    assert lengths.argmax() == farthest
+    assert lengths.max() == pytest.approx(1.0)
+    assert np.abs(sphere.restore(unit) - points).max() < 1e-5

@@ -113,6 +113,19 @@ def test_columns_vote_one_by_one_and_colours_are_averaged_on_request():
     assert mean.dtype == np.uint8
 
 
+def test_vote_that_is_tied_is_won_by_the_nearer_point_and_among_equals_by_the_lowest_row():
+    sampled = np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 2.0, 0], [0, -2.0, 0]])
+    equally_far = np.zeros((1, 3))
+    near_one = PropagationMap(torch.tensor([[1, 0, 2]]), torch.tensor([[0.5, 0.25, 0.25]]), 4)
+    labels = np.array([7, 3, 7, 5])
+
+    voted = propagate(labels, propagation_map(equally_far, sampled, 2))
+    voted_by_the_nearer = propagate(labels, near_one)
+
+    assert voted.tolist() == [7]
+    assert voted_by_the_nearer.tolist() == [3]
+
+
 def test_gradients_flow_to_features(rng):
     points = torch.rand(9, 3, generator=rng, dtype=torch.float64)
     sampled = torch.rand(6, 3, generator=rng, dtype=torch.float64)

@@ -71,14 +71,6 @@ class Entry:
             numbers = numbers[~np.isnan(numbers)]
         return numbers
 
-    def _range(self, numbers: NDArray[Any], place: int) -> tuple[Any, Any] | None:
-        """Return the smallest and the largest of the numbers that are values."""
-        if self.no_data is not None:
-            numbers = numbers[numbers != self.no_data[place]]
-        if self.kind == "f":
-            numbers = numbers[~np.isnan(numbers)]
-        return (numbers.min().item(), numbers.max().item()) if len(numbers) else None
-
     def fill(self, entry: bytearray) -> None:
         """Write the numbers into an entry of the record."""
         if self.smallest is None or self.largest is None:
