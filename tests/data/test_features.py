@@ -166,6 +166,18 @@ def test_cloud_folder_channels_have_mean_zero_and_spread_one_over_the_training_c
     assert restored.mean().item() == pytest.approx(100 + 10 * number, abs=1)
 
 
+def test_cloud_folder_each_feature_is_scaled_by_its_own_statistics_normals_by_none(folder):
+    data = of(folder, ["intensity", "normals", "other"])
+
+    values = data.train.points[..., 3:].reshape(-1, 5)
+    scaled = values[:, [0, 4]]
+    torch.testing.assert_close(scaled.mean(0), torch.zeros(2), atol=1e-5, rtol=0)
+    torch.testing.assert_close(scaled.std(0, correction=0), torch.ones(2))
+    torch.testing.assert_close(values[:, 1:4].norm(dim=1), torch.ones(180))
+    other = data.channels.columns[4]
+    assert other == ("other", pytest.approx(29.5), pytest.approx(np.arange(60).std()))
+
+
 def test_cloud_folder_coordinates_do_not_depend_on_features(folder):
     with_features = of(folder, ["intensity"])
     without = of(folder, None)
