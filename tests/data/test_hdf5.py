@@ -45,6 +45,19 @@ def test_hdf5_class_names_and_selection(folder):
         hdf5(folder, 20)
 
 
+@pytest.mark.parametrize(("train", "test"), [([0, 2], [1, 0]), ([1, 0], [0, 2])])
+def test_hdf5_without_names_has_the_classes_of_both_splits(tmp_path, train, test):
+    for split, labels in (("train", train), ("test", test)):
+        points = np.zeros((2, 5, 3), np.float32)
+        write_file(tmp_path / f"{split}.h5", data=points, label=np.array(labels))
+
+    data = hdf5(tmp_path, n_points=5)
+
+    assert data.class_names == ("class_0", "class_1", "class_2")
+    assert data.train.labels.tolist() == train
+    assert data.test.labels.tolist() == test
+
+
 def test_hdf5_invalid_input_raises(folder, tmp_path):
     with pytest.raises(UserError, match=r"^n_points must be at least 1, got 0"):
         hdf5(folder, 0)
