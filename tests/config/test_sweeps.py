@@ -32,9 +32,14 @@ TESTS_ONLY = ("noise", "corruptions")
 ON_FILES = ("las_segmentation",)
 """Sweeps whose settings of the data mean nothing for shapes."""
 PLACES = ("sampler", "task.net.sampler", "dataset")
-CELLS = (
-    "modelnet40=49 modelnet40_trials=41 ablation=18 segmentation=23 registration=23 hierarchical=24"
-)
+CELLS = {
+    "modelnet40": 49,
+    "modelnet40_trials": 41,
+    "ablation": 18,
+    "segmentation": 23,
+    "registration": 23,
+    "hierarchical": 24,
+}
 
 
 @cache
@@ -66,24 +71,33 @@ def checked(cfg):
 @pytest.mark.parametrize("name", SWEEPS)
 def test_sweep_cells_are_valid_and_named_by_swept_settings(name):
     cfg = composed(name)
+
     raw: Any = OmegaConf.to_container(cfg.hydra.sweep, resolve=False)
-    for swept in (one for grid in grids(cfg) for one in grid if one.is_sweep_override()):
-        key = swept.get_key_element()
-        known_as = "sampler_label" if key == "sampler" else key
-        names_all = "run_label" in raw["subdir"] or "override_dirname" in raw["subdir"]
-        assert names_all or known_as in raw["subdir"]
+    subdir = raw["subdir"]
+    names_all = "run_label" in subdir or "override_dirname" in subdir
+    for grid in grids(cfg):
+        for override in grid:
+            key = override.get_key_element()
+            known_as = "sampler_label" if key == "sampler" else key
+            assert names_all or known_as in subdir or not override.is_sweep_override()
     assert "${" not in f"{cfg.hydra.sweep.dir}/{cfg.hydra.sweep.subdir}"
     assert cfg.hydra.mode.name == "MULTIRUN"
-    assert (cfg.names.dataset == "shapes") == (name in (*ON_SHAPES, *TESTS_ONLY))
+    is_on_shapes = name in (*ON_SHAPES, *TESTS_ONLY)
+    assert (cfg.names.dataset == "shapes") == is_on_shapes
     checked(cfg)
 
 
-@pytest.mark.parametrize("name", sorted({*SWEEPS} - {*ON_SHAPES, *TESTS_ONLY, *ON_FILES}))
+TAKES_QUICK = sorted({*SWEEPS} - {*ON_SHAPES, *TESTS_ONLY, *ON_FILES})
+
+
+@pytest.mark.parametrize("name", TAKES_QUICK)
 def test_quick_overlay_runs_any_sweep_on_shapes(name):
     full = composed(name)
     quick = composed(name, ["+quick=shapes", "dataset=shapes"])
+
     assert quick.hydra.sweep.dir.endswith(f"/sweeps/quick/{name}")
-    assert (quick.names.dataset, quick.names.recipe) == ("shapes", "fast")
+    assert quick.names.dataset == "shapes"
+    assert quick.names.recipe == "fast"
     assert quick.dataset.n_points == 512
     assert quick.trainer.max_epochs < full.trainer.max_epochs
     for choice in ("task", "net", "sampler"):
@@ -95,31 +109,56 @@ def test_quick_overlay_runs_any_sweep_on_shapes(name):
     checked(quick)
 
 
+def different_settings(name, overrides, others):
+    """Return the paths of settings that differ between two cells of a sweep."""
+    first = settings_of(name, written_out(overrides))
+    second = settings_of(name, written_out(others))
+    different = set()
+    for path in {*first, *second}:
+        if first.get(path) != second.get(path):
+            different.add(path)
+    return different
+
+
+def written_out(overrides):
+    return tuple(f"{key}={value}" for key, value in overrides.items())
+
+
+def may_follow(path, key):
+    """Return whether a setting may differ where another one is swept."""
+    followers = {"m": PLACES[:2], "seed": PLACES}.get(key, ())
+    if path in [f"{place}.{key}" for place in followers]:
+        return True
+    if key == "sampler":  # a sampler may have an optimizer of its own
+        return path.startswith(("sampler.", "optimizer.", "names.sampler"))
+    if "@" in key:
+        return path.startswith((key.split("@")[-1], "names.stages"))
+    return path.startswith(key)
+
+
 @pytest.mark.parametrize("name", SWEEPS)
 def test_sweep_neighbours_differ_in_what_is_swept(name):
     for grid in grids(composed(name)):
-        values = {one.get_key_element(): texts(one) for one in grid}
-        first = {key: several[0] for key, several in values.items()}
-        for key in (key for key, several in values.items() if len(several) > 1):
-            one, other = (
-                settings_of(name, tuple(f"{k}={v}" for k, v in {**first, key: value}.items()))
-                for value in values[key][:2]
-            )
-            different = {path for path in {**one, **other} if one.get(path) != other.get(path)}
-            # A sampler may have an optimizer of its own.
-            placed = (key.split("@")[-1], *(["names.stages"] if "@" in key else []))
-            allowed = ("sampler.", "optimizer.", "names.sampler") if key == "sampler" else placed
-            followers = {f"{place}.{key}" for place in PLACES[: {"m": 2, "seed": 3}.get(key, 0)]}
-            assert not {path for path in different - followers if not path.startswith(allowed)}
+        values = {override.get_key_element(): texts(override) for override in grid}
+        first = {key: choices[0] for key, choices in values.items()}
+        for key, choices in values.items():
+            if len(choices) < 2:
+                continue
+            neighbour = {**first, key: choices[1]}
+            for path in different_settings(name, first, neighbour):
+                assert may_follow(path, key), path
 
 
-@pytest.mark.parametrize("cells", CELLS.split())
-def test_cells_of_several_grids_have_folders_of_their_own(cells):
-    name, number = cells.split("=")
-    several = grids(composed(name))
-    cells = [cell for grid in several for cell in BasicSweeper.split_arguments(grid, None)[0]]
-    folders = [composed(name, cell).hydra.sweep.subdir for cell in cells]
-    assert len(folders) == len(set(folders)) == int(number)
+@pytest.mark.parametrize(("name", "number"), CELLS.items())
+def test_cells_of_several_grids_have_folders_of_their_own(name, number):
+    folders = []
+    for grid in grids(composed(name)):
+        (cells,) = BasicSweeper.split_arguments(grid, None)
+        for cell in cells:
+            folders.append(composed(name, cell).hydra.sweep.subdir)
+
+    assert len(folders) == number
+    assert len(set(folders)) == number
 
 
 def texts(override):

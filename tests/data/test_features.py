@@ -90,15 +90,41 @@ def test_upward_normals_of_equal_points_point_upwards(points):
     np.testing.assert_array_equal(upward_normals(points), expected)
 
 
+def test_upward_normals_of_a_level_plane_point_up():
+    flat = np.zeros((100, 3))
+    flat[:, :2] = np.random.default_rng(0).random((100, 2))
+
+    normals = upward_normals(flat)
+
+    expected = np.tile([0.0, 0.0, 1.0], (100, 1))
+    np.testing.assert_allclose(normals, expected, atol=1e-7)
+
+
+def test_upward_normals_of_a_tilted_plane_are_exact_and_point_upwards():
+    rng = np.random.default_rng(0)
+    upward = np.array([-1.0, 2.0, 2.0]) / 3
+    across = np.cross(upward, [1.0, 0, 0])
+    along = np.cross(upward, across)
+    tilted = rng.random((100, 1)) * across + rng.random((100, 1)) * along
+
+    normals = upward_normals(tilted + 1000)
+
+    np.testing.assert_allclose(normals, np.tile(upward, (100, 1)), atol=1e-6)
+
+
 def test_upward_normals_agree_with_a_plain_loop():
     points = np.random.default_rng(1).normal(size=(50, 3))
-    expected = []
-    for point in points:
-        near = points[np.square(points - point).sum(1).argsort()[:12]]
-        direction = np.linalg.svd(near - near.mean(0))[2][2]
-        expected.append(direction if direction[2] > 0 else -direction)
 
-    np.testing.assert_allclose(upward_normals(points), np.array(expected), atol=1e-9)
+    normals = upward_normals(points)
+
+    for point, normal in zip(points, normals, strict=True):
+        squares = np.square(points - point).sum(1)
+        near = points[squares.argsort()[:12]]
+        _, _, directions = np.linalg.svd(near - near.mean(0))
+        direction = directions[2]
+        if direction[2] < 0:
+            direction = -direction
+        np.testing.assert_allclose(normal, direction, atol=1e-9)
 
 
 def test_missing_column_lists_what_the_file_has(table):
@@ -156,14 +182,12 @@ def test_cloud_folder_channels_have_mean_zero_and_spread_one_over_the_training_c
     channels = data.channels
     assert channels.names == ("intensity", "normal_x", "normal_y", "normal_z")
     assert channels.columns[1] == Channel("normal_x", 0.0, 1.0)
-    values = data.train.points[..., 3]
     assert data.train.points.shape == (3, 60, 7)
-    assert abs(values.mean()) < 1e-5
-    assert abs(values.std(correction=0) - 1) < 1e-5
-    torch.testing.assert_close(data.test.points[..., 4:].norm(dim=2), torch.ones(1, 60))
-    restored = channels.restored(data.test.points[..., 3:].double())[..., 0]
-    number = round((restored.mean().item() - 100) / 10)
-    assert restored.mean().item() == pytest.approx(100 + 10 * number, abs=1)
+    intensity = data.train.points[..., 3]
+    assert abs(intensity.mean()) < 1e-5
+    assert abs(intensity.std(correction=0) - 1) < 1e-5
+    lengths = data.test.points[..., 4:].norm(dim=2)
+    torch.testing.assert_close(lengths, torch.ones(1, 60))
 
 
 def test_cloud_folder_each_feature_is_scaled_by_its_own_statistics_normals_by_none(folder):
@@ -188,14 +212,25 @@ def test_cloud_folder_coordinates_do_not_depend_on_features(folder):
     assert without.channels == PointChannels()
 
 
+def test_cloud_folder_channels_are_restored_to_those_of_the_file(folder):
+    data = of(folder, ["intensity", "normals"])
+
+    restored = data.channels.restored(data.test.points[..., 3:].double())
+
+    mean = restored[..., 0].mean().item()
+    number_of_file = round((mean - 100) / 10)
+    assert mean == pytest.approx(100 + 10 * number_of_file, abs=1)
+
+
 def test_cloud_folder_channels_belong_to_their_points(folder):
     data = of(folder, ["intensity"], crop="nearest", n_points=20, crops=3)
 
-    values = data.channels.restored(data.train.points[..., 3:].double())[..., 0]
+    x = data.train.points[..., 0].double()
+    restored = data.channels.restored(data.train.points[..., 3:].double())
     # In a file intensity differs from x by a constant; a crop is moved and scaled.
-    for cloud, intensity in zip(data.train.points[..., 0].double(), values, strict=True):
-        correlation = torch.corrcoef(torch.stack([cloud, intensity]))[0, 1]
-        assert correlation > 0.9999
+    for x_of_cloud, intensity in zip(x, restored[..., 0], strict=True):
+        correlations = torch.corrcoef(torch.stack([x_of_cloud, intensity]))
+        assert correlations[0, 1] > 0.9999
 
 
 def test_cloud_folder_scaled_as_other_statistics_keeps_the_values(folder):

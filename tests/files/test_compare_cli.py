@@ -32,47 +32,63 @@ def folder(tmp_path_factory):
 
 
 def test_compare_writes_table_and_page(folder, tmp_path):
-    arguments = [folder / "one.ply", folder / "two.pcd", "--m", 60, 90, "--out", tmp_path]
-    out = done(main, [*arguments, "--weights", folder, "--tile", 128])
+    files = [folder / "one.ply", folder / "two.pcd"]
+    options = ["--m", 60, 90, "--weights", folder, "--tile", 128]
+
+    out = done(main, [*files, *options, "--out", tmp_path])
+
     assert "one.ply: 60 of 700 points" in out
     assert "two.pcd: 90 of 700 points" in out
     with (tmp_path / "table.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 2 * 2 * (len(UNTRAINED) + 1)
-    assert {row["method"] for row in rows} == {*UNTRAINED, "trained"}
-    largest = {row["method"]: float(row["hausdorff"]) for row in rows}
+    largest = {}
+    for row in rows:
+        largest[row["method"]] = float(row["hausdorff"])
+        assert float(row["chamfer"]) > 0
+        assert float(row["density"]) > 0
+        assert float(row["seconds"]) > 0
+    assert set(largest) == {*UNTRAINED, "trained"}
     assert largest["fps"] < largest["random"]
-    assert all(float(row[name]) > 0 for row in rows for name in ("chamfer", "density", "seconds"))
     page = (tmp_path / "compare.html").read_text()
     assert "two.pcd, 90 points" in page
     assert "How to read this" in page
 
 
+def distances_of_first_row(text):
+    """Return the distances of the first row of a table, as they are written."""
+    row = text.splitlines()[1]
+    return row.split(",")[4:6]
+
+
 def test_compare_columns_name_those_of_bin_files(folder, tmp_path):
-    points = np.random.default_rng(0).normal(size=(300, 3))
-    WRITERS[".ply"](tmp_path / "scan.ply", Table(points.astype(np.float32).astype(float)))
-    np.insert(points, 0, 7.0, axis=1).astype(np.float32).tofile(tmp_path / "scan.bin")
-    arguments = ["--m", 30, "--methods", "fps"]
+    in_ply = tmp_path / "scan.ply"
+    in_bin = tmp_path / "scan.bin"
+    points = np.random.default_rng(0).normal(size=(300, 3)).astype(np.float32)
+    constant_first = np.insert(points, 0, 7.0, axis=1)
+    constant_first.tofile(in_bin)
+    WRITERS[".ply"](in_ply, Table(points.astype(float)))
+    options = ["--m", 30, "--methods", "fps"]
+    columns = ["--columns", "intensity,x,y,z"]
 
-    done(main, [tmp_path / "scan.ply", *arguments, "--out", tmp_path / "ply"])
-    named = [*arguments, "--columns", "intensity,x,y,z", "--out", tmp_path / "bin"]
-    done(main, [tmp_path / "scan.bin", *named])
+    done(main, [in_ply, *options, "--out", tmp_path / "ply"])
+    done(main, [in_bin, *options, *columns, "--out", tmp_path / "bin"])
 
-    tables = [(tmp_path / kind / "table.csv").read_text() for kind in ("ply", "bin")]
-    distances = [text.splitlines()[1].split(",")[4:6] for text in tables]
-    assert distances[0] == distances[1]
+    of_ply = (tmp_path / "ply" / "table.csv").read_text()
+    of_bin = (tmp_path / "bin" / "table.csv").read_text()
+    assert distances_of_first_row(of_bin) == distances_of_first_row(of_ply)
 
 
 def test_compare_keeps_an_earlier_comparison(folder, tmp_path):
+    table = tmp_path / "table.csv"
     arguments = [folder / "one.ply", "--m", 30, "--methods", "random", "--out", tmp_path]
-    assert call(*arguments)[0] == 0
-    earlier = (tmp_path / "table.csv").read_text()
+    done(main, arguments)
+    earlier = table.read_text()
+
     err = refused(main, [*arguments, "--seed", 1])
+
     assert re.search(r"--out: .*table.csv exists.*--overwrite", err)
-    assert (tmp_path / "table.csv").read_text() == earlier
-    assert call(*arguments, "--seed", 1, "--overwrite")[0] == 0
-    distances = [text.split(",")[-5:-1] for text in (earlier, (tmp_path / "table.csv").read_text())]
-    assert distances[0] != distances[1]
+    assert table.read_text() == earlier
 
 
 def test_compare_page_opens_without_errors(folder, tmp_path, opened):
@@ -99,3 +115,14 @@ def test_compare_page_opens_without_errors(folder, tmp_path, opened):
 def test_compare_mistake_ends_in_one_line(arguments, said, folder):
     arguments = [str(argument).replace("FOLDER", str(folder)) for argument in arguments]
     assert re.search(said, refused(main, [folder / "one.ply", *arguments]))
+
+
+def test_compare_overwrites_an_earlier_comparison_on_request(folder, tmp_path):
+    table = tmp_path / "table.csv"
+    arguments = [folder / "one.ply", "--m", 30, "--methods", "random", "--out", tmp_path]
+    done(main, arguments)
+    earlier = table.read_text()
+
+    done(main, [*arguments, "--seed", 1, "--overwrite"])
+
+    assert distances_of_first_row(table.read_text()) != distances_of_first_row(earlier)

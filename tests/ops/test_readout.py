@@ -13,8 +13,12 @@ from tests.support.plain import plain_farthest
 def test_match_equals_kd_tree(dtype, rng):
     points = torch.randn(4, 700, 3, dtype=dtype, generator=rng)
     generated = 0.7 * torch.randn(4, 90, 3, dtype=dtype, generator=rng)
-    for cloud, sample, rows in zip(points, generated, match(generated, points), strict=True):
-        assert cKDTree(cloud.numpy()).query(sample.numpy())[1].tolist() == rows.tolist()
+
+    matched = match(generated, points)
+
+    for cloud, sample, rows in zip(points, generated, matched, strict=True):
+        _, expected = cKDTree(cloud.numpy()).query(sample.numpy())
+        assert rows.tolist() == expected.tolist()
 
 
 def test_match_has_no_gradients(rng):
@@ -40,19 +44,26 @@ def test_complete_equals_sequential_form(dtype, rng):
     indices = torch.randint(18, (6, 20), generator=rng)
     indices[0] = 7  # all matched to one point
     indices[1] = torch.randperm(50, generator=rng)[:20]  # nothing missing
+
     completed = complete(indices, points)
+
     assert completed.dtype == torch.int64
-    for b in range(6):
-        assert completed[b].tolist() == plain_complete(indices[b], points[b])
     assert torch.equal(completed[1], indices[1])
+    for cloud, matched, rows in zip(points, indices, completed, strict=True):
+        assert rows.tolist() == plain_complete(matched, cloud)
 
 
 def test_complete_fills_up_by_weight(rng):
     points = torch.randn(4, 50, 3, dtype=torch.float64, generator=rng)
-    indices, weight = torch.randint(8, (4, 20), generator=rng), torch.rand(4, 50, generator=rng)
-    for b, completed in enumerate(complete(indices, points, weight).tolist()):
-        chosen = list(dict.fromkeys(indices[b].tolist()))
-        assert completed == plain_farthest(points[b], chosen, 20, weight[b])
+    indices = torch.randint(8, (4, 20), generator=rng)
+    weight = torch.rand(4, 50, generator=rng)
+
+    completed = complete(indices, points, weight)
+
+    for cloud in range(4):
+        chosen = list(dict.fromkeys(indices[cloud].tolist()))
+        expected = plain_farthest(points[cloud], chosen, 20, weight[cloud])
+        assert completed[cloud].tolist() == expected
 
 
 def test_complete_of_coincident_points_is_distinct():

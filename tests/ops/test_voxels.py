@@ -20,16 +20,33 @@ CLOUDS = {
 }
 
 
+def in_voxels(point, size):
+    """Return exact coordinates of a point, in sizes of a voxel."""
+    return [Fraction(float(value / size)) for value in point]
+
+
 def plain_voxels(points, size):
     """Return the rows of every voxel, and the exact mean of its points in voxels."""
     rows = defaultdict(list)
     for row, point in enumerate(points):
-        rows[tuple(floor(value / size) for value in point)].append(row)
+        rows[cell_of(point, size)].append(row)
     means = {}
-    for place, members in rows.items():
-        exact = [[Fraction(float(value / size)) for value in points[row]] for row in members]
-        means[place] = [sum(axis) / len(members) for axis in zip(*exact, strict=True)]
+    for cell, members in rows.items():
+        exact = [in_voxels(points[row], size) for row in members]
+        means[cell] = [sum(axis) / len(members) for axis in zip(*exact, strict=True)]
     return rows, means
+
+
+def cell_of(point, size):
+    return tuple(floor(value / size) for value in point)
+
+
+def squared_distance(point, mean, size):
+    """Return the exact squared distance of a point to a mean, in voxels."""
+    total = Fraction(0)
+    for value, middle in zip(in_voxels(point, size), mean, strict=True):
+        total += (value - middle) ** 2
+    return total
 
 
 @pytest.mark.parametrize("cloud", CLOUDS)
@@ -41,15 +58,14 @@ def test_representatives_equal_plain_twin(cloud, size):
     rows = representatives(points, size).rows
 
     assert len(rows) == len(members)
-    chosen = {tuple(floor(value / size) for value in points[row]): row for row in rows}
+    chosen = {cell_of(points[row], size): row for row in rows}
     assert chosen.keys() == members.keys()
-    for place, row in chosen.items():
-        distances = {
-            other: sum((Fraction(float(v / size)) - mean) ** 2 for v, mean in zip(
-                points[other], means[place], strict=True))
-            for other in members[place]
-        }  # fmt: skip
-        assert float(distances[row]) <= float(min(distances.values())) * (1 + 1e-6) + 1e-18
+    for cell, row in chosen.items():
+        distances = {}
+        for other in members[cell]:
+            distances[other] = squared_distance(points[other], means[cell], size)
+        nearest = float(min(distances.values()))
+        assert float(distances[row]) <= nearest * (1 + 1e-6) + 1e-18
 
 
 def test_representatives_tie_takes_lowest_coordinates():
@@ -61,9 +77,17 @@ def test_representatives_tie_takes_lowest_coordinates():
 
 
 def test_representatives_weight_takes_heaviest_then_nearest():
-    points = np.array([[0.5, 0.5, 0.5], [0.1, 0.1, 0.1], [0.6, 0.6, 0.6], [1.5, 0.5, 0.5]])
+    points = np.array(
+        [
+            [0.5, 0.5, 0.5],
+            [0.1, 0.1, 0.1],
+            [0.6, 0.6, 0.6],
+            [1.5, 0.5, 0.5],
+        ]
+    )
+    weight = np.array([1.0, 2.0, 2.0, 0.5])
 
-    rows = representatives(points, 1.0, weight=np.array([1.0, 2.0, 2.0, 0.5])).rows
+    rows = representatives(points, 1.0, weight=weight).rows
 
     assert rows.tolist() == [2, 3]
 

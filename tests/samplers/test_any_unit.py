@@ -9,7 +9,7 @@ import torch
 from mops_lightning import FPSSampler, RandomSampler, downsample
 from mops_lightning.files.downsample import sample_cloud
 from mops_lightning.files.options import Options
-from mops_lightning.ops.points import UnitSphere
+from mops_lightning.ops.points import UnitSphere, gather_points
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.ordering import in_unit_sphere
 from mops_lightning.zoo.find_sampler import untrained
@@ -66,17 +66,18 @@ def test_points_of_a_map_are_chosen_alike_in_python_and_by_the_command_line(meth
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_arrays_tensors_and_the_sampler_give_the_same_rows(start, kind, dtype, rng):
     points = cloud_of(kind, (2, 200), dtype, rng)
-    expected = FPSSampler(50, 5, start).downsample(points)[1]
+    array = points.numpy()
+    _, expected = FPSSampler(50, 5, start).downsample(points)
 
-    tensors, rows = downsample(points, 50, seed=5, start=start)
-    arrays, array_rows = downsample(points.numpy(), 50, seed=5, start=start)
+    kept, rows = downsample(points, 50, seed=5, start=start)
+    kept_of_array, rows_of_array = downsample(array, 50, seed=5, start=start)
+    _, rows_alone = downsample(array[1], 50, seed=5, start=start)
 
     assert torch.equal(rows, expected)
-    assert array_rows.tolist() == expected.tolist()
-    assert torch.equal(tensors, points.gather(1, rows[..., None].expand(-1, -1, 3)))
-    assert (arrays == tensors.numpy()).all()
-    alone = downsample(points[1].numpy(), 50, seed=5, start=start)[1]
-    assert alone.tolist() == expected[1].tolist()
+    assert rows_of_array.tolist() == expected.tolist()
+    assert rows_alone.tolist() == expected[1].tolist()
+    assert torch.equal(kept, gather_points(points, rows))
+    assert (kept_of_array == kept.numpy()).all()
 
 
 def test_exact_ties_of_the_given_coordinates_are_ties():
@@ -104,8 +105,11 @@ def test_samplers_of_nets_get_the_unit_sphere(rng):
             assert points.norm(dim=2).amax() <= 1 + 1e-6
             return RandomSampler(m)(points)
 
-    points = torch.randn(1, 60, 3, generator=rng) * 1000
-    rows = FirstPoints(6).downsample(points)[1]
+    points = torch.randn(60, 3, generator=rng) * 1000
 
-    sphere = UnitSphere.around(points[0].double().numpy()).normalise(points[0].double().numpy())
-    assert torch.equal(rows, RandomSampler(6)(sphere[None]).indices)
+    _, rows = FirstPoints(6).downsample(points)
+
+    in_double = points.double().numpy()
+    sphere = UnitSphere.around(in_double).normalise(in_double)
+    (expected,) = RandomSampler(6)(sphere[None]).indices
+    assert torch.equal(rows, expected)

@@ -1,5 +1,6 @@
 """Every task trains with every sampler and every value of ``learn`` that exists."""
 
+import math
 from functools import partial
 from typing import Any
 
@@ -42,13 +43,17 @@ LEARNED = ("mops", "fmops", "snet", "samplenet", "samplenet-progressive")
 def trained_parts(task: str, sampler: str | None, learn: Any) -> set[str]:
     """Train one step and return which of task and sampler changed: weights or statistics."""
     torch.manual_seed(0)
-    made = None if sampler is None else SAMPLERS[sampler](LARGEST)
-    module = Experiment(TASKS[task](), made, learn, partial(torch.optim.Adam, lr=1e-2))
+    task_module = TASKS[task]()
+    sampler_module = None
+    if sampler is not None:
+        sampler_module = SAMPLERS[sampler](LARGEST)
+    make_optimizer = partial(torch.optim.Adam, lr=1e-2)
+    module = Experiment(task_module, sampler_module, learn, make_optimizer)
     data = small_dataset(train=4, points=POINTS)
-    loader = CloudLoader(data.train, 4, shuffle=True, make_batch=module.task.make_batch)
+    loader = CloudLoader(data.train, 4, shuffle=True, make_batch=task_module.make_batch)
     before = state(module)
     quiet_trainer(1).fit(module, loader, loader)
-    return {name.split(".")[0] for name in changed(before, module)}
+    return {name.partition(".")[0] for name in changed(before, module)}
 
 
 LEARNS = {
@@ -72,16 +77,21 @@ def test_task_step_without_sampler_changes_task(task):
 @pytest.mark.parametrize("task", TASKS)
 def test_disagreement_is_zero_only_for_equal_predictions(task: str) -> None:
     module = TASKS[task]().eval()
-    loader = CloudLoader(small_dataset(4, points=POINTS).test, 4, make_batch=module.make_batch)
-    batch = next(iter(loader))
+    data = small_dataset(4, points=POINTS)
+    batch = next(iter(CloudLoader(data.test, 4, make_batch=module.make_batch)))
     reference = module.predict(batch, batch.points)
+    prediction = module.predict(batch, 9 - batch.points[:, :8])
+
     same = module.disagreement(reference, reference)
-    other = module.disagreement(module.predict(batch, 9 - batch.points[:, :8]), reference)
-    assert same.shape == other.shape == (4,)
+    other = module.disagreement(prediction, reference)
+
+    assert same.shape == (4,)
+    assert other.shape == (4,)
     assert same.abs().max() < 1e-6
     assert other.min() > 1e-6
     other.sum().backward()
-    assert any(p.grad is not None and p.grad.any() for p in module.parameters())
+    gradients = [p.grad for p in module.parameters() if p.grad is not None]
+    assert any(gradient.any() for gradient in gradients)
 
 
 def test_disagreement_is_divergence_of_reference_from_prediction():
@@ -89,16 +99,27 @@ def test_disagreement_is_divergence_of_reference_from_prediction():
     task = Classification(PointNetVanilla(2), 2)
     reference = torch.tensor([[0.9, 0.1]])
     found = torch.tensor([[0.5, 0.5]])
-    expected = 0.9 * torch.tensor(0.9 / 0.5).log() + 0.1 * torch.tensor(0.1 / 0.5).log()
+
     apart = task.disagreement(found.log(), reference.log() + 3)  # logits, up to a constant
-    torch.testing.assert_close(apart, expected[None])
+
+    expected = 0.9 * math.log(0.9 / 0.5) + 0.1 * math.log(0.1 / 0.5)
+    torch.testing.assert_close(apart, torch.tensor([expected]))
 
 
 def test_smoothed_labels_give_every_class_a_share(rng):
     task = Classification(PointNetVanilla(4), 4, label_smoothing=0.2).eval()
-    batch = Batch(torch.randn(3, 9, 3, generator=rng), torch.tensor([0, 2, 3]))
-    labels = 0.8 * torch.eye(4)[batch.labels] + 0.2 / 4
-    expected = -(labels * task.predict(batch, batch.points).log_softmax(1)).sum(1).mean()
-    torch.testing.assert_close(task.step(batch, batch.points).losses["cross_entropy"], expected)
+    points = torch.randn(3, 9, 3, generator=rng)
+    labels = torch.tensor([0, 2, 3])
+    batch = Batch(points, labels)
+
+    loss = task.step(batch, points).losses["cross_entropy"]
+
+    targets = 0.8 * torch.eye(4)[labels] + 0.2 / 4
+    log_shares = task.predict(batch, points).log_softmax(1)
+    expected = -(targets * log_shares).sum(1).mean()
+    torch.testing.assert_close(loss, expected)
+
+
+def test_label_smoothing_of_one_is_refused():
     with pytest.raises(UserError, match=r"label_smoothing must be in \[0, 1\), got 1"):
         Classification(PointNetVanilla(4), 4, label_smoothing=1.0)

@@ -18,15 +18,18 @@ class Kabsch(torch.nn.Module):
     """The exact answer where point i of the source is point i of the target."""
 
     def forward(self, source, target):
-        a = source.mean(1, keepdim=True)
-        b = target.mean(1, keepdim=True)
-        u, _, vh = torch.linalg.svd((source - a).mT @ (target - b))
+        source_mean = source.mean(1, keepdim=True)
+        target_mean = target.mean(1, keepdim=True)
+        covariance = (source - source_mean).mT @ (target - target_mean)
+        u, _, vh = torch.linalg.svd(covariance)
+        handedness = torch.linalg.det(vh.mT @ u.mT).sign()
         flip = torch.eye(3).repeat(len(u), 1, 1)
-        flip[:, 2, 2] = torch.linalg.det(vh.mT @ u.mT).sign()
+        flip[:, 2, 2] = handedness
         rotation = vh.mT @ flip @ u.mT
-        shift = b - a @ rotation.mT
+        shift = target_mean - source_mean @ rotation.mT
         scalar_last = Rotation.from_matrix(rotation.numpy()).as_quat()
-        return Motion(torch.from_numpy(scalar_last).roll(1, 1).float(), shift[:, 0])
+        quaternion = torch.from_numpy(scalar_last).roll(1, 1)
+        return Motion(quaternion.float(), shift[:, 0])
 
 
 def small_net():
@@ -42,10 +45,13 @@ def test_step_exact_net_recovers_motions(rng):
     source = torch.randn(5, 40, 3, generator=rng) + 3  # far from its centroid
     true = motion(1)
     batch = pair_batch(source, true.apply(source), true)
+
     result = task(Kabsch()).step(batch, batch.points)
+
+    found = result.predictions
     assert torch.equal(result.targets.translation, true.translation)
-    assert RotationError.of(result.predictions, true).max() < 1e-2
-    torch.testing.assert_close(result.predictions.translation, true.translation, atol=1e-4, rtol=0)
+    assert RotationError.of(found, true).max() < 1e-2
+    torch.testing.assert_close(found.translation, true.translation, atol=1e-4, rtol=0)
     assert sum(result.losses.values()) < 1e-3
 
 
@@ -75,18 +81,31 @@ def test_test_samples_sources_and_targets_in_one_call():
     assert sampler.shapes == [(8, 40, 3)]
 
 
+def text_of(axes):
+    return axes.texts[0].get_text()
+
+
 def test_figures_show_every_readout_and_its_error(rng):
-    data = CloudLoader(small_dataset().test, 4, make_batch=(module := task()).make_batch)
-    batch = data.batch_of(torch.tensor([0, 1]))
-    samples = {"sampled": FPSSampler(8)(batch.points).points, "full": batch.points}
+    module = task()
+    loader = CloudLoader(small_dataset().test, 4, make_batch=module.make_batch)
+    batch = loader.batch_of(torch.tensor([0, 1]))
+    sample = FPSSampler(8)(batch.points).points
+    samples = {"sampled": sample, "full": batch.points}
+
     figures = figures_of(module, batch, samples, ["long", "tall"])
+
     axes = figures["pairs"].axes
     # Samples have rings, full clouds have none.
-    assert [len(one.collections) for one in axes] == [2, 4, 2, 2, 4, 2]
-    assert [one.get_title() for one in axes[:3]] == ["before (centred)", "by sampled", "by full"]
+    assert [len(cell.collections) for cell in axes] == [2, 4, 2, 2, 4, 2]
+    titles = [cell.get_title() for cell in axes[:3]]
+    assert titles == ["before (centred)", "by sampled", "by full"]
     result = module.step(batch, batch.points)
-    error = RotationError.of(result.predictions, result.targets)[1]
-    assert axes[5].texts[0].get_text() == f"rotation error {error:.1f}°"
-    angle = RotationError.of(result.targets, identity_motion(batch.points[:2]))[1]
-    assert axes[3].texts[0].get_text() == f"tall, {angle:.1f}° apart"
-    assert cloud_titles(module, ["long"]) == ["long_source", "long_target"]
+    _, error = RotationError.of(result.predictions, result.targets)
+    assert text_of(axes[5]) == f"rotation error {error:.1f}°"
+    still = identity_motion(batch.points[:2])
+    _, angle = RotationError.of(result.targets, still)
+    assert text_of(axes[3]) == f"tall, {angle:.1f}° apart"
+
+
+def test_clouds_of_a_pair_have_titles_of_their_own():
+    assert cloud_titles(task(), ["long"]) == ["long_source", "long_target"]

@@ -1,5 +1,7 @@
 """``downsample(points, m, stratify=classes)``."""
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 import torch
@@ -48,29 +50,12 @@ def test_stratify_samples_every_class_on_its_own():
 
 @pytest.mark.parametrize("labels", [np.uint8, np.int64, ">i4"])
 def test_stratify_takes_arrays_of_whole_numbers(labels):
-    classes = np.abs(CLASSES.numpy()).astype(labels)
+    classes = CLASSES.abs().numpy()
 
-    points, rows = downsample(CLOUD.numpy(), 0.1, stratify=classes, stratify_min=5)
+    points, rows = downsample(CLOUD.numpy(), 0.1, stratify=classes.astype(labels), stratify_min=5)
 
     assert isinstance(points, np.ndarray)
-    assert kept_classes(rows, classes.astype(int)) == {1: 3, 3: 12, 7: 5}
-
-
-def test_stratify_of_a_batch_a_list_and_a_flat_batch():
-    flipped = CLASSES.flip(0)
-    both = torch.stack([CLOUD, CLOUD.flip(0)])
-    batch = torch.arange(2).repeat_interleave(200)
-    one = downsample(CLOUD, 20, stratify=CLASSES, stratify_min=5)[1]
-    other = downsample(CLOUD.flip(0), 20, stratify=flipped, stratify_min=5)[1]
-
-    _, stacked = downsample(both, 20, stratify=torch.stack([CLASSES, flipped]), stratify_min=5)
-    _, listed = downsample(list(both), 20, stratify=[CLASSES, flipped], stratify_min=5)
-    joined = torch.cat([CLASSES, flipped])
-    _, flat = downsample(both.flatten(0, 1), 20, batch=batch, stratify=joined, stratify_min=5)
-
-    assert stacked.tolist() == [one.tolist(), other.tolist()]
-    assert [rows.tolist() for rows in listed] == [one.tolist(), other.tolist()]
-    assert flat.tolist() == [*one.tolist(), *(200 + other).tolist()]
+    assert kept_classes(rows, classes) == {1: 3, 3: 12, 7: 5}
 
 
 def test_stratify_with_weights_keeps_heavy_points_of_each_class():
@@ -101,3 +86,49 @@ def test_stratify_with_weights_keeps_heavy_points_of_each_class():
 def test_stratify_refuses(arguments, words):
     with pytest.raises(UserError, match=words):
         downsample(CLOUD, **{"m": 20, **arguments})
+
+
+class TwoClouds(NamedTuple):
+    """Two clouds, their classes, and the rows that each alone would keep."""
+
+    clouds: torch.Tensor
+    classes: torch.Tensor
+    rows: list[list[int]]
+
+
+@pytest.fixture
+def two_clouds():
+    clouds = torch.stack([CLOUD, CLOUD.flip(0)])
+    classes = torch.stack([CLASSES, CLASSES.flip(0)])
+    rows = []
+    for cloud, of_cloud in zip(clouds, classes, strict=True):
+        _, kept = downsample(cloud, 20, stratify=of_cloud, stratify_min=5)
+        rows.append(kept.tolist())
+    return TwoClouds(clouds, classes, rows)
+
+
+def test_stratify_of_a_batch(two_clouds):
+    _, rows = downsample(two_clouds.clouds, 20, stratify=two_clouds.classes, stratify_min=5)
+
+    assert rows.tolist() == two_clouds.rows
+
+
+def test_stratify_of_a_list(two_clouds):
+    clouds = list(two_clouds.clouds)
+    classes = list(two_clouds.classes)
+
+    _, rows = downsample(clouds, 20, stratify=classes, stratify_min=5)
+
+    first, second = rows
+    assert [first.tolist(), second.tolist()] == two_clouds.rows
+
+
+def test_stratify_of_a_flat_batch(two_clouds):
+    clouds = two_clouds.clouds.flatten(0, 1)
+    classes = two_clouds.classes.flatten()
+    batch = torch.arange(2).repeat_interleave(200)
+
+    _, rows = downsample(clouds, 20, batch=batch, stratify=classes, stratify_min=5)
+
+    first, second = two_clouds.rows
+    assert rows.tolist() == [*first, *(200 + row for row in second)]

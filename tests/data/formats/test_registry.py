@@ -1,6 +1,7 @@
 """What holds for every format: what is written is read again, and bad files are named."""
 
 import os
+import struct
 from typing import Any
 
 import laspy
@@ -34,7 +35,10 @@ def written(table, suffix, tmp_path):
 
 @pytest.mark.parametrize("suffix", [".ply", ".pcd", ".npz", ".txt", ".xyz"])
 def test_points_and_columns_round_trip(table, suffix, tmp_path):
-    again = read(written(table, suffix, tmp_path), 100, 0)
+    path = written(table, suffix, tmp_path)
+
+    again = read(path, 100, 0)
+
     np.testing.assert_allclose(again.points, table.points, rtol=1e-7, atol=1e-9)
     assert list(again.columns) == list(table.columns)
     for name, column in table.columns.items():
@@ -47,14 +51,6 @@ def test_points_round_trip(table, suffix, tmp_path):
     np.testing.assert_allclose(again.points, table.points, atol=1e-6)
     if suffix == ".bin":
         np.testing.assert_array_equal(again.columns["intensity"], table.columns["intensity"])
-
-
-def test_written_files_open_in_other_libraries(table, tmp_path):
-    cloud: Any = trimesh.load(written(table, ".ply", tmp_path))
-    np.testing.assert_allclose(cloud.vertices, table.points, atol=1e-6)
-    las = laspy.read(written(table, ".laz", tmp_path))
-    np.testing.assert_allclose(np.stack([las.x, las.y, las.z], 1), table.points, atol=1e-6)
-    np.testing.assert_array_equal(las["label"], table.columns["label"])
 
 
 AWKWARD = {
@@ -70,51 +66,113 @@ AWKWARD = {
 }
 
 
+def test_written_ply_opens_in_trimesh(table, tmp_path):
+    path = written(table, ".ply", tmp_path)
+
+    cloud: Any = trimesh.load(path)
+
+    np.testing.assert_allclose(cloud.vertices, table.points, atol=1e-6)
+
+
+def test_written_laz_opens_in_laspy(table, tmp_path):
+    path = written(table, ".laz", tmp_path)
+
+    las = laspy.read(path)
+
+    np.testing.assert_allclose(las.xyz, table.points, atol=1e-6)
+    np.testing.assert_array_equal(las["label"], table.columns["label"])
+
+
 @pytest.mark.parametrize("suffix", [".ply", ".pcd", ".npz", ".txt", ".las"])
 def test_awkward_columns_keep_numbers(suffix, tmp_path):
-    points = np.random.default_rng(0).random((4, 3)) + np.array([1e6, 0, 0])
-    again = read(written(Table(points, AWKWARD), suffix, tmp_path), 9, 0)
+    unit = np.random.default_rng(0).random((4, 3))
+    points = unit + np.array([1e6, 0, 0])
+    path = written(Table(points, AWKWARD), suffix, tmp_path)
+
+    again = read(path, 9, 0)
+
     np.testing.assert_allclose(again.points, points, rtol=0, atol=1e-6)
-    columns = [c for c in again.columns.values() if c.any()]
+    columns = [column for column in again.columns.values() if column.any()]
     for name, column in AWKWARD.items():
-        assert any(np.array_equal(found, column) for found in columns), name
+        is_equal = [np.array_equal(found, column) for found in columns]
+        assert any(is_equal), name
 
 
-def test_coordinates_far_from_origin_keep_digits(tmp_path):
-    points = np.random.default_rng(0).random((20, 3)) + np.array([1e9, 5.4e6, 100])
-    for suffix in (".ply", ".pcd", ".npy", ".npz", ".xyz", ".las"):
-        again = read(written(Table(points), suffix, tmp_path), 100, 0)
-        np.testing.assert_allclose(again.points, points, rtol=0, atol=1e-6)
+FAR = np.random.default_rng(0).random((20, 3)) + np.array([1e9, 5.4e6, 100])
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd", ".npy", ".npz", ".xyz", ".las"])
+def test_coordinates_far_from_origin_keep_digits(suffix, tmp_path):
+    path = written(Table(FAR), suffix, tmp_path)
+
+    again = read(path, 100, 0)
+
+    np.testing.assert_allclose(again.points, FAR, rtol=0, atol=1e-6)
+
+
+def test_coordinates_far_from_origin_are_not_written_in_single_precision(tmp_path):
     with pytest.raises(UserError, match="holds float32"):
-        written(Table(points), ".bin", tmp_path)
+        written(Table(FAR), ".bin", tmp_path)
 
 
-def test_strings_dates_and_lists_are_left_out(tmp_path):
-    rows = np.zeros(3, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("n", "U3"), ("d", "M8[s]")])
-    np.save(tmp_path / "a.npy", rows)
-    assert not read(tmp_path / "a.npy", 9, 0).columns
-    np.savez(tmp_path / "a.npz", points=np.ones((3, 3)), names=np.array(["a", "b", "c"]))
-    assert not read(tmp_path / "a.npz", 9, 0).columns
-    head = "property float x\nproperty float y\nproperty float z\nproperty list uchar int l\n"
-    head = f"ply\nformat binary_little_endian 1.0\nelement vertex 2\n{head}end_header\n"
-    row = np.array([1, 2, 3], "<f4").tobytes() + b"\x01\x05\0\0\0"
-    (tmp_path / "a.ply").write_bytes(head.encode() + row * 2)
-    table = read(tmp_path / "a.ply", 9, 0)
-    np.testing.assert_array_equal(table.take(np.array([0])).points, [[1, 2, 3]])
+def test_strings_and_dates_of_a_structured_array_are_left_out(tmp_path):
+    path = tmp_path / "a.npy"
+    fields = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("n", "U3"), ("d", "M8[s]")]
+    np.save(path, np.zeros(3, fields))
+
+    assert not read(path, 9, 0).columns
+
+
+def test_strings_of_an_npz_file_are_left_out(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez(path, points=np.ones((3, 3)), names=np.array(["a", "b", "c"]))
+
+    assert not read(path, 9, 0).columns
+
+
+WITH_LIST = """\
+ply
+format binary_little_endian 1.0
+element vertex 2
+property float x
+property float y
+property float z
+property list uchar int l
+end_header
+"""
+
+
+def test_lists_of_a_ply_file_are_left_out(tmp_path):
+    path = tmp_path / "a.ply"
+    row = struct.pack("<fffBi", 1, 2, 3, 1, 5)
+    path.write_bytes(WITH_LIST.encode() + row + row)
+
+    table = read(path, 9, 0)
+
+    assert table.points.tolist() == [[1, 2, 3], [1, 2, 3]]
+    first = table.take(np.array([0]))
+    assert first.points.tolist() == [[1, 2, 3]]
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".npy", ".bin", ".las", ".laz"])
 def test_row_range_equals_slice_of_file(suffix, tmp_path):
-    points = np.random.default_rng(1).normal(size=(500, 3)).astype(np.float32).astype(float)
     path = tmp_path / f"in{suffix}"
-    WRITERS[suffix](path, Table(points, {"intensity": np.arange(500, dtype=np.uint16)}))
+    points = np.random.default_rng(1).normal(size=(500, 3)).astype(np.float32).astype(float)
+    intensity = np.arange(500, dtype=np.uint16)
+    WRITERS[suffix](path, Table(points, {"intensity": intensity}))
+
     cloud = open_cloud_file(path)
+    whole = cloud.read(range(500)).points
+    first = cloud.read(range(0, 3)).points
+    middle = cloud.read(range(200, 400)).points
+    last = cloud.read(range(499, 500)).points
+
     assert cloud.number == 500
-    assert [len(rows) for rows in cloud.row_ranges(200)] == [200, 200, 100]
-    whole = cloud.read(range(500))
-    np.testing.assert_allclose(whole.points, points, atol=1e-6)
-    for rows in (range(0, 3), range(200, 400), range(499, 500)):
-        np.testing.assert_array_equal(cloud.read(rows).points, whole.points[rows.start : rows.stop])
+    assert list(cloud.row_ranges(200)) == [range(200), range(200, 400), range(400, 500)]
+    np.testing.assert_allclose(whole, points, atol=1e-6)
+    np.testing.assert_array_equal(first, whole[:3])
+    np.testing.assert_array_equal(middle, whole[200:400])
+    np.testing.assert_array_equal(last, whole[499:])
 
 
 ASCII = (

@@ -12,11 +12,16 @@ from mops_lightning.zoo.names import UNTRAINED
 
 @pytest.mark.parametrize("name", [*UNTRAINED, FPS_FARTHEST])
 def test_saved_method_chooses_the_points_that_were_scored(name, tmp_path, rng):
-    clouds = normalize_unit_sphere(torch.rand(2, 100, 3, generator=rng))
-    methods = [Untrained("fps"), Untrained(name)]
-    choices = [keep.Choice(16, name), keep.Choice(32, "fps")]
+    points = torch.rand(2, 100, 3, generator=rng)
+    clouds = normalize_unit_sphere(points)
+    scored = Untrained(name)
+    choices = [
+        keep.Choice(16, name),
+        keep.Choice(32, "fps"),
+    ]
 
-    keep.save(tmp_path / "best.safetensors", choices, methods, seed=3)
+    keep.save(tmp_path / "best.safetensors", choices, [Untrained("fps"), scored], seed=3)
+    sampler = load(tmp_path / "best")
 
-    rows = load(tmp_path / "best")(clouds, 16).indices
-    assert torch.equal(rows, Untrained(name).rows(clouds, 16, seed=3))
+    output = sampler(clouds, 16)
+    assert torch.equal(output.indices, scored.rows(clouds, 16, seed=3))
