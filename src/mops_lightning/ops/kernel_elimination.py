@@ -160,6 +160,18 @@ def _crowdings(planes, axes, number, size, boxes, starts, near, limit, inverse, 
     return crowding
 
 
+@jit_inlined
+def _only_place(values, start, stop, wanted):
+    """Return the place of a value that occurs, or -1 if it occurs more than once."""
+    places = np.int64(0)
+    number = np.int64(0)
+    for i in range(stop - start):
+        is_wanted = np.int64(values[start + i] == wanted)
+        places += is_wanted * i
+        number += is_wanted
+    return start + places if number == 1 else np.int64(-1)
+
+
 @jit
 def _lowest_row(start, stop, rows, crowding, shares, top, lowest):
     """Return the place of the lowest row with the largest crowding, if it is below ``lowest``."""
@@ -175,6 +187,10 @@ def _lowest_row(start, stop, rows, crowding, shares, top, lowest):
 def _most_crowded(tops, group_tops, size, rows, crowding, shares):
     """Return the place of the most crowded point, the lowest row in case of ties."""
     top = _top(group_tops)
+    if len(shares) == 0:
+        place = _only_most_crowded(tops, group_tops, size, crowding, top)
+        if place >= 0:
+            return place
     lowest, best = np.int64(2**62), 0
     for group in range(len(group_tops)):
         if group_tops[group] != top:
@@ -188,6 +204,20 @@ def _most_crowded(tops, group_tops, size, rows, crowding, shares):
                 if found >= 0:
                     best = found
     return best
+
+
+@jit_inlined
+def _only_most_crowded(tops, group_tops, size, crowding, top):
+    """Return the place of the only point with the largest crowding, or -1 in case of ties.
+
+    The loops without branches take a third of the time of a search for ties.
+    """
+    place = _only_place(group_tops, 0, len(group_tops), top)
+    if place >= 0:
+        place = _only_place(tops, GROUP * place, min(GROUP * (place + 1), len(tops)), top)
+    if place >= 0:
+        place = _only_place(crowding, size * place, size * (place + 1), top)
+    return place
 
 
 @jit
