@@ -32,9 +32,10 @@ def test_random_crops_nearest_is_a_ball_around_a_point():
 
     assert crops.shape == (6, 50, 3)
     assert np.abs(crops.mean(1)).max() < 1e-5
-    first = points[np.random.default_rng(1).integers(len(points))]
-    distances = np.sort(np.linalg.norm(points - first, axis=1))[:50]
-    near = points[np.linalg.norm(points - first, axis=1) <= distances[-1]]
+    centre = points[np.random.default_rng(1).integers(len(points))]
+    distances = np.linalg.norm(points - centre, axis=1)
+    radius = np.sort(distances)[49]
+    near = points[distances <= radius]
     assert np.allclose(crops[0], near - near.mean(0), atol=1e-5)
 
 
@@ -54,27 +55,33 @@ def test_random_crops_of_coincident_points_raises():
 
 
 def test_tiles_have_every_point_as_their_own_once():
-    points = np.random.default_rng(0).random((1000, 3)) * [100, 60, 5] + 5e5
+    unit = np.random.default_rng(0).random((1000, 3))
+    points = unit * [100, 60, 5] + 5e5
 
     tiles = cut(points, 96)
 
     assert tiles.own is not None
     assert tiles.points.shape == (11, 96, 3)
-    assert np.sort(tiles.rows[tiles.own]).tolist() == list(range(1000))
+    own_rows = tiles.rows[tiles.own]
+    assert np.sort(own_rows).tolist() == list(range(1000))
     assert abs(tiles.points.mean(1)).max() < 1e-4
 
 
 def test_tiles_are_filled_up_by_near_points_of_other_tiles():
-    points = np.random.default_rng(0).random((1000, 3)) * [100, 60, 5]
+    unit = np.random.default_rng(0).random((1000, 3))
+    points = unit * [100, 60, 5]
 
     tiles = cut(points, 96)
 
     assert tiles.own is not None
-    for rows, own in zip(tiles.rows, tiles.own, strict=True):
-        assert len(set(rows.tolist())) == 96
-        middle = points[rows[own]].mean(0)
-        reach = np.linalg.norm(points[rows[own]] - middle, axis=1).max()
-        assert np.linalg.norm(points[rows[~own]] - middle, axis=1).max() < 1.5 * reach
+    for rows, is_own in zip(tiles.rows, tiles.own, strict=True):
+        assert len(np.unique(rows)) == 96
+        own = points[rows[is_own]]
+        others = points[rows[~is_own]]
+        middle = own.mean(0)
+        radius = np.linalg.norm(own - middle, axis=1).max()
+        reach = np.linalg.norm(others - middle, axis=1).max()
+        assert reach < 1.5 * radius
 
 
 def test_tiles_of_as_many_points_as_a_tile_are_the_whole_cloud():

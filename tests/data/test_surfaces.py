@@ -14,30 +14,53 @@ from tests.support.meshes import BALL, write_mesh
 meshes = partial(cloud_folder, test_frames=None, crop="surface", crops=1)
 
 
+TWO_TRIANGLES = """\
+OFF
+6 2 0
+0 0 5
+3 0 5
+0 3 5
+9 0 5
+10 0 5
+9 1 5
+3 0 1 2
+3 3 4 5
+"""
+"""A big and a small triangle in the plane z = 5: 90 % and 10 % of the area."""
+
+
 def test_sample_surface_is_uniform_by_area(tmp_path):
-    # A big and a small triangle in the plane z = 5: 90 % and 10 % of the area.
-    text = "OFF\n6 2 0\n0 0 5\n3 0 5\n0 3 5\n9 0 5\n10 0 5\n9 1 5\n3 0 1 2\n3 3 4 5\n"
-    (tmp_path / "two.off").write_text(text)
-    points = sample_surface(tmp_path / "two.off", 10_000, seed=0)[1].numpy()
+    path = tmp_path / "two.off"
+    path.write_text(TWO_TRIANGLES)
+
+    _, sampled = sample_surface(path, 10_000, seed=0)
+
+    points = sampled.numpy()
     assert np.ptp(points[:, 2]) == 0
-    small = points[:, 0] > points[:, 0].min() + 0.6 * np.ptp(points[:, 0])
-    assert abs(small.mean() - 0.1) < 0.012  # four standard deviations
     assert len(np.unique(points, axis=0)) == 10_000
+    x = points[:, 0]
+    along = (x - x.min()) / np.ptp(x)
+    share_of_small = (along > 0.6).mean()
+    assert abs(share_of_small - 0.1) < 0.012  # four standard deviations
 
 
 def test_sampling_cloud_depends_on_content_and_seed(mesh_layout, tmp_path):
-    before = repr(np.random.get_state())  # noqa: NPY002
-    first = meshes(mesh_layout, n_points=50)
-    assert repr(np.random.get_state()) == before  # noqa: NPY002
     elsewhere = tmp_path / "elsewhere"
     shutil.copytree(mesh_layout, elsewhere)
     write_mesh(elsewhere / "ball" / "train" / "ball_0.off", BALL)
-    again = meshes(elsewhere, n_points=50)
-    assert torch.equal(again.train.points[1:], first.train.points)
-    other = meshes(mesh_layout, n_points=50, seed=1)
-    assert not torch.isclose(other.train.points, first.train.points).all(-1).any()
+    state = repr(np.random.get_state())  # noqa: NPY002
+
+    first = meshes(mesh_layout, n_points=50).train.points
+    state_after = repr(np.random.get_state())  # noqa: NPY002
+    again = meshes(elsewhere, n_points=50).train.points
+    other = meshes(mesh_layout, n_points=50, seed=1).train.points
+
+    assert state_after == state
+    assert torch.equal(again[1:], first)
+    is_equal = torch.isclose(other, first).all(-1)
+    assert not is_equal.any()
     # Files with the same shape at different scales have different samples.
-    assert not torch.allclose(first.train.points[1], first.train.points[2], atol=1e-3)
+    assert not torch.allclose(first[1], first[2], atol=1e-3)
 
 
 def test_sampling_fingerprint_depends_on_content_names_and_arguments(mesh_layout, tmp_path):
@@ -57,21 +80,31 @@ def test_sampling_fingerprint_depends_on_content_names_and_arguments(mesh_layout
     assert len(prints) == 6
 
 
+def add_one(path):
+    """Change the points that a file of a cache holds."""
+    points = np.load(path)["arr_0"]
+    np.savez(path, points + np.float32(1))
+
+
 def test_sampling_cache_depends_on_content_and_arguments(mesh_layout, tmp_path):
     cache = tmp_path / "new" / "cache"
+    moved = tmp_path / "moved"
     first = meshes(mesh_layout, n_points=20, cache=cache)
     kept = sorted(cache.iterdir())
-    assert [path.suffix for path in kept] == [".npz"] * 5
     (cache / f"{TEMPORARY}left by a kill.npz").touch()
-    for path in kept:  # the result comes from the cache
-        np.savez(path, np.load(path)["arr_0"] + np.float32(1))
-    shutil.move(mesh_layout, tmp_path / "moved")
-    again = meshes(tmp_path / "moved", n_points=20, cache=str(cache))
-    assert torch.equal(again.train.points, first.train.points + 1)
-    assert again.fingerprint == first.fingerprint
-    meshes(tmp_path / "moved", n_points=21, cache=cache)
-    meshes(tmp_path / "moved", n_points=20, cache=cache, seed=1)
-    write_mesh(tmp_path / "moved" / "box" / "train" / "box_1.off", BALL)
-    changed = meshes(tmp_path / "moved", n_points=20, cache=cache)
+    for path in kept:
+        add_one(path)
+    shutil.move(mesh_layout, moved)
+
+    from_cache = meshes(moved, n_points=20, cache=str(cache))
+    meshes(moved, n_points=21, cache=cache)
+    meshes(moved, n_points=20, cache=cache, seed=1)
+    write_mesh(moved / "box" / "train" / "box_1.off", BALL)
+    changed = meshes(moved, n_points=20, cache=cache)
+
+    assert [path.suffix for path in kept] == [".npz"] * 5
+    assert torch.equal(from_cache.train.points, first.train.points + 1)
+    assert from_cache.fingerprint == first.fingerprint
     assert len(list(cache.iterdir())) == 16
-    assert changed.train.points[1].norm(dim=1).max() < 1.001
+    radii_of_changed = changed.train.points[1].norm(dim=1)
+    assert radii_of_changed.max() < 1.001

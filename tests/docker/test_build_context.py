@@ -14,15 +14,22 @@ DOCKERFILES = ("cpu", "cuda")
 
 def commands(name: str) -> list[str]:
     """Return the lines of a Dockerfile without comments, continued lines joined."""
-    lines = (ROOT / "docker" / f"{name}.Dockerfile").read_text().splitlines()
-    text = "\n".join(line for line in lines if not line.startswith("#"))
-    return [line for line in text.replace("\\\n", "").splitlines() if line]
+    content = (ROOT / "docker" / f"{name}.Dockerfile").read_text()
+    lines = [line for line in content.splitlines() if not line.startswith("#")]
+    joined = "\n".join(lines).replace("\\\n", "")
+    return [line for line in joined.splitlines() if line]
 
 
 def copied(name: str) -> set[str]:
     """Return what is copied from the build context."""
-    copies = [line.split()[1:-1] for line in commands(name) if line.startswith("COPY ")]
-    return {source for sources in copies if sources[0][:2] != "--" for source in sources}
+    sources: set[str] = set()
+    for command in commands(name):
+        if command.startswith("COPY "):
+            _, *paths, _ = command.split()
+            is_from_another_stage = paths[0].startswith("--")
+            if not is_from_another_stage:
+                sources.update(paths)
+    return sources
 
 
 def ignored(path: str) -> bool:
@@ -56,9 +63,14 @@ def test_copied_sources_exist_in_the_build_context(name):
 @pytest.mark.parametrize("name", DOCKERFILES)
 def test_copied_sources_suffice_for_the_wheel(name):
     pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    project, wheel = pyproject["project"], pyproject["tool"]["hatch"]["build"]["targets"]["wheel"]
+    project = pyproject["project"]
+    wheel = pyproject["tool"]["hatch"]["build"]["targets"]["wheel"]
+
     needed = {"pyproject.toml", project["readme"], *project["license-files"]}
-    needed |= {package.split("/")[0] for package in wheel["packages"]} | {*wheel["force-include"]}
+    needed.update(wheel["force-include"])
+    for package in wheel["packages"]:
+        needed.add(package.partition("/")[0])
+
     assert needed <= copied(name)
 
 
@@ -72,11 +84,12 @@ def test_pip_install_uses_the_constraints(name):
 
 @pytest.mark.parametrize("name", DOCKERFILES)
 def test_image_reads_las_files(name):
-    step = next(line for line in commands(name) if "import tomllib" in line)
-    code = step.split('python -c "')[1].split('"')[0]
+    (step,) = [line for line in commands(name) if "import tomllib" in line]
+    _, _, quoted = step.partition('python -c "')
+    code, _, _ = quoted.partition('"')
 
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
 
     requirements = done.stdout.splitlines()
-    assert [line for line in requirements if line.startswith("laspy[lazrs]")]
-    assert [line for line in requirements if line.startswith("torch>=")]
+    assert any(line.startswith("laspy[lazrs]") for line in requirements)
+    assert any(line.startswith("torch>=") for line in requirements)

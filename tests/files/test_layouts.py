@@ -1,6 +1,7 @@
 """``--columns`` and ``--vertices`` on the command line."""
 
 import numpy as np
+import pytest
 import trimesh
 
 from mops_lightning.data.formats.registry import read
@@ -8,20 +9,28 @@ from mops_lightning.files.cli import propagate
 from tests.support.captured import done
 from tests.support.downsample import call, refused
 
+SIX_COLUMNS = ["--columns", "x,y,z,r,g,b"]
 
-def test_downsample_columns_names_those_of_a_bin_file(tmp_path):
+
+@pytest.fixture
+def six_columns(tmp_path):
+    """A .bin file of 60 points with six columns, and its rows."""
+    path = tmp_path / "a.bin"
     rows = np.random.default_rng(0).normal(size=(60, 6)).astype(np.float32)
-    rows.tofile(tmp_path / "a.bin")
-    arguments = ["--method", "fps", "--m", 60, "--columns", "x,y,z,r,g,b"]
+    rows.tofile(path)
+    return path, rows
 
-    status, _, err = call(tmp_path / "a.bin", tmp_path / "b.npy", *arguments)
 
-    assert (status, err) == (0, "")
-    kept = np.load(tmp_path / "b.npy")
+def test_downsample_columns_names_those_of_a_bin_file(six_columns, tmp_path):
+    path, rows = six_columns
+    out = tmp_path / "b.npy"
+
+    status, _, err = call(path, out, "--method", "fps", "--m", 60, *SIX_COLUMNS)
+
+    assert status == 0
+    assert err == ""
+    kept = np.load(out)
     assert sorted(kept.tolist()) == sorted(rows.tolist())
-    assert call(tmp_path / "a.bin", tmp_path / "c.bin", *arguments, "--chunk", 60)[0] == 0
-    again = np.fromfile(tmp_path / "c.bin", "<f4").reshape(-1, 6)
-    assert sorted(again.tolist()) == sorted(rows.tolist())
 
 
 def test_downsample_columns_of_another_format_is_refused(tmp_path):
@@ -33,31 +42,55 @@ def test_downsample_columns_of_another_format_is_refused(tmp_path):
     assert "--columns is for .bin files" in said
 
 
-def test_propagate_columns_names_those_of_a_bin_file(tmp_path):
-    rows = np.random.default_rng(0).normal(size=(60, 6)).astype(np.float32)
-    rows.tofile(tmp_path / "a.bin")
-    np.savez(tmp_path / "small.npz", points=rows[:1, :3], label=[7])
+def test_downsample_columns_names_those_of_a_bin_file_in_chunks(six_columns, tmp_path):
+    path, rows = six_columns
+    out = tmp_path / "c.bin"
 
-    files = [tmp_path / "small.npz", tmp_path / "a.bin"]
-    done(propagate, [*files, "--field", "label", "--columns", "x,y,z,r,g,b"])
+    status, _, _ = call(path, out, "--method", "fps", "--m", 60, *SIX_COLUMNS, "--chunk", 60)
+
+    assert status == 0
+    kept = np.fromfile(out, "<f4").reshape(-1, 6)
+    assert sorted(kept.tolist()) == sorted(rows.tolist())
+
+
+def test_propagate_columns_names_those_of_a_bin_file(six_columns, tmp_path):
+    path, rows = six_columns
+    small = tmp_path / "small.npz"
+    np.savez(small, points=rows[:1, :3], label=[7])
+
+    done(propagate, [small, path, "--field", "label", *SIX_COLUMNS])
 
     made = read(tmp_path / "a_propagated.ply", 9, 0)
     np.testing.assert_array_equal(made.columns["b"], rows[:, 5])
     assert made.columns["label"].tolist() == [7] * 60
 
 
-def test_downsample_vertices_takes_those_of_a_mesh(tmp_path):
-    box = trimesh.creation.icosphere(subdivisions=2)
-    for suffix in (".ply", ".off"):
-        box.export(tmp_path / f"a{suffix}")
-        arguments = ["--method", "fps", "--m", 50, "--vertices"]
+def as_set(points):
+    return {tuple(point) for point in points}
 
-        assert call(tmp_path / f"a{suffix}", tmp_path / "b.npy", *arguments, "--overwrite")[0] == 0
 
-        kept = np.load(tmp_path / "b.npy")[:, :3]
-        vertices = read(tmp_path / f"a{suffix}", 9, 0, vertices=True).points
-        assert len(kept) == 50
-        assert {tuple(row) for row in kept} <= {tuple(row) for row in vertices}
-        np.testing.assert_allclose(vertices, box.vertices, atol=1e-6)
-    said = refused(tmp_path / "a.ply", tmp_path / "c.npy", *arguments, "--surface", 60)
+@pytest.mark.parametrize("suffix", [".ply", ".off"])
+def test_downsample_vertices_takes_those_of_a_mesh(suffix, tmp_path):
+    path = tmp_path / f"a{suffix}"
+    out = tmp_path / "b.npy"
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    ball.export(path)
+
+    status, _, _ = call(path, out, "--method", "fps", "--m", 50, "--vertices")
+
+    assert status == 0
+    kept = np.load(out)[:, :3]
+    vertices = read(path, 9, 0, vertices=True).points
+    assert len(kept) == 50
+    assert as_set(kept) <= as_set(vertices)
+    np.testing.assert_allclose(vertices, ball.vertices, atol=1e-6)
+
+
+def test_downsample_vertices_of_a_sampled_surface_is_refused(tmp_path):
+    path = tmp_path / "a.ply"
+    trimesh.creation.icosphere(subdivisions=2).export(path)
+    vertices = ["--method", "fps", "--m", 50, "--vertices"]
+
+    said = refused(path, tmp_path / "c.npy", *vertices, "--surface", 60)
+
     assert "leave --surface out" in said

@@ -15,9 +15,11 @@ def motions(rotation, translation=None):
 
 
 def in_batches(metric, predicted, true):
-    for i in range(0, len(true.quaternion), 7):
-        batch = (Motion(*(part[i : i + 7] for part in both)) for both in (predicted, true))
-        metric.update(*batch)
+    for start in range(0, len(true.quaternion), 7):
+        stop = start + 7
+        predicted_batch = Motion(*(part[start:stop] for part in predicted))
+        true_batch = Motion(*(part[start:stop] for part in true))
+        metric.update(predicted_batch, true_batch)
     return metric.compute().item()
 
 
@@ -28,43 +30,72 @@ def recall(limit):
     return Recall()
 
 
-def test_rotation_error_matches_scipy():
-    a = Rotation.random(40, random_state=1)
-    b = Rotation.random(40, random_state=2)
-    want = np.degrees((a.inv() * b).magnitude())
-    given = motions(a), motions(b)
-    assert in_batches(registration.RotationError(), *given) == pytest.approx(want.mean(), abs=1e-4)
+def test_rotation_errors_match_scipy():
+    predicted = Rotation.random(40, random_state=1)
+    true = Rotation.random(40, random_state=2)
+    angles = np.degrees((predicted.inv() * true).magnitude())
+    given = (motions(predicted), motions(true))
+
+    mean = in_batches(registration.RotationError(), *given)
     doubled = in_batches(registration.DoubledRotationError(), *given)
-    assert doubled == pytest.approx(2 * want.mean(), abs=1e-4)
     p90 = in_batches(registration.RotationErrorP90(), *given)
-    assert p90 == pytest.approx(np.quantile(want, 0.9), abs=1e-3)
-    for limit in (60.0, 150.0):
-        share = (want <= limit).mean()
-        assert in_batches(recall(limit), *given) == pytest.approx(share)
+
+    assert mean == pytest.approx(angles.mean(), abs=1e-4)
+    assert doubled == pytest.approx(2 * angles.mean(), abs=1e-4)
+    assert p90 == pytest.approx(np.quantile(angles, 0.9), abs=1e-3)
+
+
+@pytest.mark.parametrize("limit", [60.0, 150.0])
+def test_recall_matches_scipy(limit):
+    predicted = Rotation.random(40, random_state=1)
+    true = Rotation.random(40, random_state=2)
+
+    share = in_batches(recall(limit), motions(predicted), motions(true))
+
+    angles = np.degrees((predicted.inv() * true).magnitude())
+    assert share == pytest.approx((angles <= limit).mean())
 
 
 def test_equal_rotations_score_zero_despite_rounding():
     same = motions(Rotation.random(5000, random_state=3))
-    cosine = 2 * (same.quaternion * same.quaternion).sum(1) ** 2 - 1
-    assert torch.acos(cosine).isnan().any()  # what the formula would give
-    assert registration.RotationError()(same, same) < 1e-4
-    assert recall(5.0)(same, same) == 1
     flipped = Motion(-same.quaternion, same.translation)
-    assert registration.RotationError()(flipped, same) < 1e-4
+    error = registration.RotationError()
+
+    error_of_same = error(same, same)
+    error_of_flipped = error(flipped, same)
+
+    product = (same.quaternion * same.quaternion).sum(1)
+    cosine = 2 * product**2 - 1
+    assert torch.acos(cosine).isnan().any()  # what the formula would give
+    assert error_of_same < 1e-4
+    assert error_of_flipped < 1e-4
+    assert recall(5.0)(same, same) == 1
 
 
 def test_translation_error_is_mean_distance():
-    turn = Rotation.identity(2)
-    predicted = motions(turn, torch.tensor([[3.0, 4, 0], [0, 0, 0]]))
-    true = motions(turn, torch.tensor([[0.0, 0, 0], [0, 1, 0]]))
-    assert registration.TranslationError()(predicted, true).item() == pytest.approx(3.0)
+    still = Rotation.identity(2)
+    predicted = motions(still, torch.tensor([[3.0, 4.0, 0.0], [0.0, 0.0, 0.0]]))
+    true = motions(still, torch.tensor([[0.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
+
+    error = registration.TranslationError()(predicted, true)
+
+    assert error.item() == pytest.approx((5 + 1) / 2)
+
+
+def turned_about_x(*angles):
+    return motions(Rotation.from_euler("x", np.array(angles)[:, None], degrees=True))
 
 
 def test_recalls_include_limits_of_5_and_10_degrees():
-    angles = [[4.9], [5.1], [9.9], [10.1]]
-    turned = motions(Rotation.from_euler("x", angles, degrees=True))
+    turned = turned_about_x(4.9, 5.1, 9.9, 10.1)
     still = motions(Rotation.identity(4))
+
     assert registration.RotationRecall5()(turned, still) == 1 / 4
     assert registration.RotationRecall10()(turned, still) == 3 / 4
-    exact = motions(Rotation.from_euler("x", [[0.0], [90.0]], degrees=True))
-    assert recall(0.0)(exact, motions(Rotation.identity(2))) == 0.5
+
+
+def test_recall_includes_its_limit():
+    turned = turned_about_x(0.0, 90.0)
+    still = motions(Rotation.identity(2))
+
+    assert recall(0.0)(turned, still) == 0.5

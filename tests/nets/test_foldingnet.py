@@ -6,25 +6,27 @@ from mops_lightning.nets import foldingnet
 from mops_lightning.nets.foldingnet import REACH, Fold, FoldingDecoder, MFoldingNet, square_grid
 
 
-def test_square_grid_is_regular_and_nearly_square():
-    for n in (1, 2, 7, 12, 79, 256, 313, 1024):
-        grid = square_grid(n)
-        assert grid.shape == (n, 2)
-        assert grid.abs().max() <= REACH
-        assert len({tuple(row) for row in grid.tolist()}) == n
-        sides = sorted(len(set(grid[:, axis].tolist())) for axis in (0, 1))
-        assert sides[1] <= 4 * sides[0]
+@pytest.mark.parametrize("n", [1, 2, 7, 12, 79, 256, 313, 1024])
+def test_square_grid_is_regular_and_nearly_square(n):
+    grid = square_grid(n)
+
+    assert grid.shape == (n, 2)
+    assert grid.abs().max() <= REACH
+    assert len(grid.unique(dim=0)) == n
+    columns = len(grid[:, 0].unique())
+    rows = len(grid[:, 1].unique())
+    assert max(columns, rows) <= 4 * min(columns, rows)
 
 
 def plain_folding(decoder, codeword, n):
     """FoldingNet's decoder as published, with the codeword repeated for every grid point."""
-    grid = square_grid(n).expand(len(codeword), -1, -1)
-    points = grid
+    repeated = codeword[:, None].expand(-1, n, -1)
+    points = square_grid(n).expand(len(codeword), -1, -1)
     for fold in (decoder.first, decoder.second):
-        rows = torch.cat([codeword[:, None].expand(-1, n, -1), points], 2)
+        joined = torch.cat([repeated, points], 2)
         weight = torch.cat([fold.from_piece.weight, fold.from_coordinates.weight], 1)
-        hidden = F.relu(F.linear(rows, weight, fold.from_piece.bias))
-        points = fold.rest(fold.narrow(hidden))
+        hidden = F.linear(joined, weight, fold.from_piece.bias)
+        points = fold.rest(fold.narrow(hidden.relu()))
     return points
 
 
@@ -37,12 +39,14 @@ def test_decoder_with_one_piece_equals_foldingnet(rng):
 
 def test_decoder_pieces_share_weights(rng):
     decoder = FoldingDecoder(16, 4, (32, 8))
+    of_one_piece = FoldingDecoder(4, 1, (32, 8))
+    of_one_piece.load_state_dict(decoder.state_dict())
     codeword = torch.randn(2, 16, generator=rng)
+
     out = decoder(codeword, 48).unflatten(1, (12, 4))
-    one = FoldingDecoder(4, 1, (32, 8))
-    one.load_state_dict(decoder.state_dict())
-    for piece in range(4):
-        alone = one(codeword[:, 4 * piece : 4 * piece + 4], 12)
+
+    for piece, part in enumerate(codeword.chunk(4, dim=1)):
+        alone = of_one_piece(part, 12)
         torch.testing.assert_close(out[:, :, piece], alone, atol=1e-5, rtol=1e-4)
 
 
@@ -67,20 +71,20 @@ def test_fold_in_blocks_equals_plain_folding(channels, rows, shared, rng, monkey
     monkeypatch.setitem(foldingnet.BLOCK_ROWS, "cpu", rows)
     torch.manual_seed(0)
     fold = Fold(6, 3, channels).double()
+    number = 1 if shared else 5
     pieces = torch.randn(5, 6, generator=rng, dtype=torch.float64).requires_grad_()
-    coordinates = torch.randn(1 if shared else 5, 7, 3, generator=rng, dtype=torch.float64)
-    coordinates.requires_grad_()
+    coordinates = torch.randn(number, 7, 3, generator=rng, dtype=torch.float64).requires_grad_()
+    direction = torch.randn(5, 7, 3, generator=rng, dtype=torch.float64)
 
-    def plain():
-        hidden = fold.from_piece(pieces)[:, None] + fold.from_coordinates(coordinates)
-        return fold.rest(fold.narrow(hidden.relu()))
+    folded = fold(pieces, coordinates)
 
+    hidden = fold.from_piece(pieces)[:, None] + fold.from_coordinates(coordinates)
+    expected = fold.rest(fold.narrow(hidden.relu()))
+    torch.testing.assert_close(folded, expected)
     inputs = (pieces, coordinates, *fold.parameters())
-    torch.testing.assert_close(fold(pieces, coordinates), plain())
-    weights = torch.randn(5, 7, 3, generator=rng, dtype=torch.float64)
-    want = torch.autograd.grad((plain() * weights).sum(), inputs)
-    got = torch.autograd.grad((fold(pieces, coordinates) * weights).sum(), inputs)
-    torch.testing.assert_close(got, want)
+    gradients = torch.autograd.grad((folded * direction).sum(), inputs)
+    expected_gradients = torch.autograd.grad((expected * direction).sum(), inputs)
+    torch.testing.assert_close(gradients, expected_gradients)
 
 
 def test_fold_does_not_save_hidden_layer(rng):

@@ -15,25 +15,35 @@ def pair():
     """Two samples of one box, and the motion between them."""
     source = torch.from_numpy(box(600, seed=1))[None] / 4
     target = torch.from_numpy(box(600, seed=2))[None] / 4
-    true = motion_of_vectors(torch.tensor([[0.05, -0.1, 0.08]]), torch.tensor([[0.03, 0.0, -0.02]]))
+    turn = torch.tensor([[0.05, -0.1, 0.08]])
+    shift = torch.tensor([[0.03, 0.0, -0.02]])
+    true = motion_of_vectors(turn, shift)
     return source.float(), true.apply(target.float()), true
 
 
+def random_system(rng, number):
+    """Return levers, residuals and weights of a batch of one."""
+    levers = torch.from_numpy(rng.normal(size=(1, number, 6)))
+    residuals = torch.from_numpy(rng.normal(size=(1, number)))
+    weights = torch.from_numpy(rng.random((1, number)))
+    return levers, residuals, weights
+
+
 def test_weighted_step_equals_least_squares_of_numpy():
-    rng = np.random.default_rng(0)
-    levers, residuals, weights = rng.normal(size=(30, 6)), rng.normal(size=30), rng.random(30)
-    roots = np.sqrt(weights)
+    levers, residuals, weights = random_system(np.random.default_rng(0), 30)
 
-    expected = np.linalg.lstsq(levers * roots[:, None], -residuals * roots)[0]
-    found = weighted_step(*(torch.from_numpy(x)[None] for x in (levers, residuals, weights)))
+    (step,) = weighted_step(levers, residuals, weights)
 
-    assert found[0].numpy() == pytest.approx(expected, abs=1e-6)
+    roots = weights[0].sqrt().numpy()
+    weighted_levers = levers[0].numpy() * roots[:, None]
+    weighted_residuals = residuals[0].numpy() * roots
+    expected, *_ = np.linalg.lstsq(weighted_levers, -weighted_residuals)
+    assert step.numpy() == pytest.approx(expected, abs=1e-6)
 
 
 def test_step_has_the_gradients_of_its_formula():
-    rng = np.random.default_rng(0)
-    levers, residuals, weights = rng.normal(size=(9, 6)), rng.normal(size=9), rng.random(9)
-    arguments = [torch.tensor(x[None], requires_grad=True) for x in (levers, residuals, weights)]
+    system = random_system(np.random.default_rng(0), 9)
+    arguments = [values.requires_grad_() for values in system]
 
     assert torch.autograd.gradcheck(weighted_step, arguments)
 

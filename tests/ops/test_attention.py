@@ -6,7 +6,10 @@ from mops_lightning.ops.attention import Partial, attend
 
 def random_input(n, m, c=8, seed=0):
     rng = torch.Generator().manual_seed(seed)
-    return tuple(torch.randn(*shape, generator=rng) for shape in ((m, c), (n, c), (n, 3)))
+    queries = torch.randn(m, c, generator=rng)
+    keys = torch.randn(n, c, generator=rng)
+    values = torch.randn(n, 3, generator=rng)
+    return queries, keys, values
 
 
 def plain_attend(queries, keys, values):
@@ -18,37 +21,59 @@ def test_attend_equals_softmax(rng):
     queries = torch.randn(600, 8, generator=rng, dtype=torch.float64) * 5
     keys = torch.randn(2100, 8, generator=rng, dtype=torch.float64) * 5
     values = torch.randn(2100, 3, generator=rng, dtype=torch.float64)
+
     found = attend(queries, keys, values)
+
+    expected = (queries @ keys.mT).softmax(1) @ values
     assert isinstance(found, Partial)
-    torch.testing.assert_close(found.result(), (queries @ keys.mT).softmax(1) @ values)
+    torch.testing.assert_close(found.result(), expected)
 
 
-@pytest.mark.parametrize("height", [-50.0, 30.0, 100.0, 3e4])
-def test_attend_outlier_between_probes_equals_softmax(height):
-    queries, keys, points = random_input(n=3000, m=5)
+@pytest.fixture(params=[-50.0, 30.0, 100.0, 3e4])
+def with_outlier(request):
+    """Queries, keys and values, of which two keys are far from all others."""
+    queries, keys, values = random_input(n=3000, m=5)
+    direction = queries[3] / queries[3].square().sum()
     # Rows 1 and 2 are not probes, which are about 46 rows apart and start with row 0.
-    keys[1] = queries[3] * height / queries[3].square().sum()
+    keys[1] = request.param * direction
     keys[2] = keys[1] * 0.999
-    found = attend(queries, keys, points)
-    want = plain_attend(queries, keys, points)
-    torch.testing.assert_close(found.result().double(), want, rtol=1e-4, atol=1e-5)
-    parts = [
-        attend(queries, keys[rows], points[rows])
-        for rows in (slice(0, 1), slice(1, 2), slice(2, 3000))
-    ]
-    merged = parts[0].merge(parts[1]).merge(parts[2])
-    torch.testing.assert_close(merged.result(), found.result(), rtol=1e-4, atol=1e-5)
+    return queries, keys, values
+
+
+def test_attend_outlier_between_probes_equals_softmax(with_outlier):
+    queries, keys, values = with_outlier
+
+    found = attend(queries, keys, values).result()
+
+    expected = plain_attend(queries, keys, values)
+    torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_attend_merges_parts_with_an_outlier(with_outlier):
+    queries, keys, values = with_outlier
+    whole = attend(queries, keys, values).result()
+
+    first = attend(queries, keys[:1], values[:1])
+    outlier = attend(queries, keys[1:2], values[1:2])
+    rest = attend(queries, keys[2:], values[2:])
+    merged = first.merge(outlier).merge(rest).result()
+
+    torch.testing.assert_close(merged, whole, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_attend_half_precision_does_not_overflow(dtype):
-    queries, keys, points = random_input(n=3000, m=50)
-    queries, keys, points = queries.to(dtype) / 0.2, keys.to(dtype), points.to(dtype)
-    found = attend(queries, keys, points)
+    queries, keys, values = random_input(n=3000, m=50)
+    queries = queries.to(dtype) / 0.2
+    keys = keys.to(dtype)
+    values = values.to(dtype)
+
+    found = attend(queries, keys, values).result()
+
     logits = queries.double() @ keys.double().mT
-    digits = float(logits.abs().max()) * torch.finfo(dtype).eps
-    want = plain_attend(queries, keys, points)
-    torch.testing.assert_close(found.result().double(), want, rtol=0, atol=2 * digits)
+    rounding = float(logits.abs().max()) * torch.finfo(dtype).eps
+    expected = plain_attend(queries, keys, values)
+    torch.testing.assert_close(found.double(), expected, rtol=0, atol=2 * rounding)
 
 
 def test_attend_huge_logits_stay_in_range_of_values():

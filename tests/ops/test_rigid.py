@@ -16,10 +16,11 @@ def rotations(number=200, seed=0):
     """Return random and special rotations: none, tiny, and half turns, exact and almost."""
     rng = np.random.default_rng(seed)
     axes = np.concatenate([np.eye(3), rng.normal(size=(7, 3))])
-    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-    special = np.concatenate([axes * angle for angle in ANGLES])
+    unit_axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    vectors = np.concatenate([unit_axes * angle for angle in ANGLES])
     at_random = Rotation.random(number, random_state=seed)
-    return Rotation.concatenate([at_random, Rotation.from_rotvec(special)])
+    special = Rotation.from_rotvec(vectors)
+    return Rotation.concatenate([at_random, special])
 
 
 def quaternions(rotation):
@@ -144,10 +145,13 @@ def test_random_motion_covers_its_translations():
 
 
 def test_random_motion_covers_its_angles():
-    drawn = rigid.random_motion(45.0, 0.5, [generator(i) for i in range(2000)])
+    generators = [generator(number) for number in range(2000)]
+
+    drawn = rigid.random_motion(45.0, 0.5, generators)
 
     scalar_last = np.roll(drawn.quaternion.numpy(), -1, 1)
-    angles = np.abs(Rotation.from_quat(scalar_last).as_euler("xyz", degrees=True))
+    rotation = Rotation.from_quat(scalar_last)
+    angles = np.abs(rotation.as_euler("xyz", degrees=True))
     assert angles.max() <= 45.001
     assert (angles.max(0) > 44).all()
 

@@ -12,6 +12,9 @@ from tests.support.meshes import BALL, BOX, scaled, write_mesh
 POINTS = 1024
 
 
+SPLITS = ("train", "test")
+
+
 def write_all(top: Path) -> None:
     """Write a folder for each form of data.
 
@@ -19,20 +22,30 @@ def write_all(top: Path) -> None:
     """
     _write_modelnet40(top / "modelnet40")
     _write_one_class(top / "hdf5")
-    for split in ("train", "test"):
-        for name, mesh in (("ball", BALL), ("box", BOX)):
-            for number in (1, 2):
-                path = top / "meshes" / name / split / f"{number}.off"
-                write_mesh(path, scaled(mesh, float(number)))
+    _write_meshes(top / "meshes")
     for number in range(12):
         path = top / "mesh_sequence" / "walk" / f"{number:02d}.ply"
         write_mesh(path, scaled(BOX, 1 + number / 9))
-    (top / "clouds").mkdir()
+    _write_clouds(top / "clouds")
+    write_airborne(top / "airborne" / "train" / "tile.las", 0)
+    write_airborne(top / "airborne" / "test" / "tile.las", 1)
+
+
+def _write_meshes(folder: Path) -> None:
+    """Write two balls and two boxes of different size for each split."""
+    for split in SPLITS:
+        for number in (1, 2):
+            scale = float(number)
+            write_mesh(folder / "ball" / split / f"{number}.off", scaled(BALL, scale))
+            write_mesh(folder / "box" / split / f"{number}.off", scaled(BOX, scale))
+
+
+def _write_clouds(folder: Path) -> None:
+    """Write six clouds of random points."""
+    folder.mkdir()
     for number in range(6):
-        cloud = np.random.default_rng(number).random((3000, 3)).astype("float32")
-        np.save(top / "clouds" / f"scan{number}.npy", cloud)
-    for split, seed in (("train", 0), ("test", 1)):
-        write_airborne(top / "airborne" / split / "tile.las", seed)
+        cloud = np.random.default_rng(number).random((3000, 3))
+        np.save(folder / f"scan{number}.npy", cloud.astype("float32"))
 
 
 def write_airborne(path: Path, seed: int, number: int = 1000) -> None:
@@ -41,7 +54,8 @@ def write_airborne(path: Path, seed: int, number: int = 1000) -> None:
     points = random.uniform(0, [40, 30, 0.2], (number, 3))
     points += (500_000, 4_000_000, 100)
     is_ground = random.random(number) < 0.6
-    points[~is_ground, 2] += random.uniform(2, 6, (~is_ground).sum())
+    is_above = ~is_ground
+    points[is_above, 2] += random.uniform(2, 6, is_above.sum())
     columns = {
         "classification": np.where(is_ground, 2, 1).astype("uint8"),
         "intensity": np.where(is_ground, 40, 200).astype("uint16"),
@@ -55,20 +69,26 @@ def write_airborne(path: Path, seed: int, number: int = 1000) -> None:
 def _write_modelnet40(folder: Path) -> None:
     """Write ModelNet40's files with clouds for two of its 40 classes."""
     folder.mkdir()
-    names = [f"class_{number}" for number in range(40)]
-    names[0] = "airplane"
+    names = ["airplane", *(f"class_{number}" for number in range(1, 40))]
     (folder / "shape_names.txt").write_text("\n".join(names) + "\n")
-    for seed, (split, clouds) in enumerate((("train", 8), ("test", 4))):
-        points = np.random.default_rng(seed).normal(size=(clouds, POINTS, 3)).astype("float32")
-        points /= np.linalg.norm(points, axis=2).max(axis=1)[:, None, None]
-        labels = np.arange(clouds)[:, None] % 2
-        write_file(folder / f"ply_data_{split}0.h5", data=points, label=labels.astype("uint8"))
-        (folder / f"{split}_files.txt").write_text(f"data/{folder.name}/ply_data_{split}0.h5\n")
+    _write_modelnet40_split(folder, "train", seed=0, number=8)
+    _write_modelnet40_split(folder, "test", seed=1, number=4)
+
+
+def _write_modelnet40_split(folder: Path, split: str, seed: int, number: int) -> None:
+    points = np.random.default_rng(seed).normal(size=(number, POINTS, 3)).astype("float32")
+    radii = np.linalg.norm(points, axis=2).max(axis=1)
+    points /= radii[:, None, None]
+    labels = np.arange(number)[:, None] % 2
+    name = f"ply_data_{split}0.h5"
+    write_file(folder / name, data=points, label=labels.astype("uint8"))
+    (folder / f"{split}_files.txt").write_text(f"data/{folder.name}/{name}\n")
 
 
 def _write_one_class(folder: Path) -> None:
     """Write train.h5 and test.h5 of one class without names, as the paper's airplanes are."""
     folder.mkdir()
-    for split, clouds in (("train", 8), ("test", 4)):
-        points = np.random.default_rng(clouds).normal(size=(clouds, POINTS, 3)).astype("float32")
-        write_file(folder / f"{split}.h5", data=points, label=np.zeros(clouds, "int64"))
+    for split, number in (("train", 8), ("test", 4)):
+        points = np.random.default_rng(number).normal(size=(number, POINTS, 3))
+        labels = np.zeros(number, "int64")
+        write_file(folder / f"{split}.h5", data=points.astype("float32"), label=labels)

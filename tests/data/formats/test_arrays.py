@@ -35,42 +35,49 @@ def test_npy_fortran_order_is_rejected_in_chunks(tmp_path):
 
 @pytest.mark.parametrize("kind", ["las", "laz", "copc.laz"])
 def test_npz_arrays_become_dimensions_of_las_and_arrays_again(kind, tmp_path):
+    source = tmp_path / "in.npz"
+    path = tmp_path / f"cloud.{kind}"
+    target = tmp_path / "back.npz"
     rng = np.random.default_rng(0)
-    arrays: dict[str, Any] = {
-        "points": np.arange(60.0).reshape(20, 3),
+    scores = rng.random((20, 4)).astype(np.float32)
+    named_alike: dict[str, Any] = {
         "normals": rng.normal(size=(20, 3)).astype(np.float32),
         "uv": rng.random((20, 2)),
         "rgb": rng.integers(0, 256, (20, 3)).astype(np.uint8),
-        "scores": rng.random((20, 4)).astype(np.float32),
         "classification": np.arange(20, dtype=np.uint8) % 6,
         "intensity": np.arange(20, dtype=np.uint16) * 3000,
     }
-    np.savez(tmp_path / "in.npz", **arrays)
-    path = tmp_path / f"cloud.{kind}"
+    points = np.arange(60.0).reshape(20, 3)
+    np.savez(source, points=points, **named_alike, scores=scores)
 
-    WRITERS[f".{kind}"](path, read(tmp_path / "in.npz", 9, 0))
-    WRITERS[".npz"](tmp_path / "back.npz", read(path, 9, 0))
+    WRITERS[f".{kind}"](path, read(source, 9, 0))
+    WRITERS[".npz"](target, read(path, 9, 0))
 
-    second = laspy.read(path)
-    back = np.load(tmp_path / "back.npz")
-    order = np.argsort(np.asarray(second.x))  # COPC sorts the points
-    extra = ["normals", "uv", "rgb", "scores_0", "scores_1", "scores_2", "scores_3"]
-    assert list(second.point_format.extra_dimension_names) == extra
-    for name in ("normals", "uv", "rgb", "classification", "intensity"):
-        assert np.array_equal(np.asarray(second[name])[order], arrays[name])
-        assert np.array_equal(back[name][order], arrays[name])
-        assert back[name].dtype == arrays[name].dtype
-    assert np.array_equal(np.stack([back[name] for name in extra[3:]], 1)[order], arrays["scores"])
+    las = laspy.read(path)
+    back = np.load(target)
+    order = np.argsort(np.asarray(las.x))  # COPC sorts the points
+    extra = list(las.point_format.extra_dimension_names)
+    scores_apart = ["scores_0", "scores_1", "scores_2", "scores_3"]
+    assert extra == ["normals", "uv", "rgb", *scores_apart]
+    for name, values in named_alike.items():
+        in_las = np.asarray(las[name])
+        assert np.array_equal(in_las[order], values)
+        assert np.array_equal(back[name][order], values)
+        assert back[name].dtype == values.dtype
+    joined_scores = np.column_stack([back[name] for name in scores_apart])
+    assert np.array_equal(joined_scores[order], scores)
 
 
 @pytest.mark.parametrize(("largest", "version"), [(31, "1.2"), (200, "1.4")])
 def test_classes_of_npz_decide_the_version_of_las(largest, version, tmp_path):
+    source = tmp_path / "in.npz"
+    target = tmp_path / "out.las"
     classes = np.array([1, 2, largest], np.uint8)
-    np.savez(tmp_path / "in.npz", points=np.eye(3), classification=classes)
+    np.savez(source, points=np.eye(3), classification=classes)
 
-    WRITERS[".las"](tmp_path / "out.las", read(tmp_path / "in.npz", 9, 0))
+    WRITERS[".las"](target, read(source, 9, 0))
 
-    second = laspy.read(tmp_path / "out.las")
-    assert str(second.header.version) == version
-    assert list(second.classification) == classes.tolist()
-    assert not list(second.point_format.extra_dimension_names)
+    las = laspy.read(target)
+    assert str(las.header.version) == version
+    assert list(las.classification) == [1, 2, largest]
+    assert not list(las.point_format.extra_dimension_names)

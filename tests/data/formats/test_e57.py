@@ -16,12 +16,13 @@ QUARTER_TURN = np.array([np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
 
 def scan(number, **more):
     random = np.random.default_rng(number)
-    axes = dict(
-        zip(("cartesianX", "cartesianY", "cartesianZ"), random.random((3, 30)), strict=True)
-    )
-    intensity = random.random(30).astype(np.float32)
-    colours = {name: random.integers(0, 256, 30).astype(np.uint8) for name in COLOURS}
-    return axes | {"intensity": intensity} | colours | more
+    columns = {}
+    for axis in AXES:
+        columns[axis] = random.random(30)
+    columns["intensity"] = random.random(30).astype(np.float32)
+    for colour in COLOURS:
+        columns[colour] = random.integers(0, 256, 30).astype(np.uint8)
+    return columns | more
 
 
 AXES = ("cartesianX", "cartesianY", "cartesianZ")
@@ -29,26 +30,31 @@ COLOURS = ("colorRed", "colorGreen", "colorBlue")
 
 
 def points_of(data):
-    return np.stack([data[f"cartesian{axis}"] for axis in "XYZ"], 1).astype(np.float32)
+    points = np.column_stack([data[axis] for axis in AXES])
+    return points.astype(np.float32)
 
 
 def test_read_e57_joins_scans_at_their_poses(tmp_path):
     path = tmp_path / "a.e57"
-    first, second = scan(1), scan(2)
+    first = scan(1)
+    second = scan(2)
+    first_shift = np.array([1000.5, 2000.0, 0.0])
+    second_shift = np.array([0.0, 0.0, 5.0])
     with pye57.E57(str(path), mode="w") as file:
-        file.write_scan_raw(first, translation=np.array([1000.5, 2000, 0]))
-        file.write_scan_raw(second, rotation=QUARTER_TURN, translation=np.array([0, 0, 5.0]))
+        file.write_scan_raw(first, translation=first_shift)
+        file.write_scan_raw(second, rotation=QUARTER_TURN, translation=second_shift)
 
     table = read(path, 9, 0)
 
-    turned = points_of(second)[:, [1, 0, 2]] * [-1, 1, 1] + [0, 0, 5]
-    moved = points_of(first) + np.array([1000.5, 2000, 0])
-    expected = np.concatenate([moved, turned])
+    x, y, z = points_of(second).T
+    turned = np.column_stack([-y, x, z])
+    expected = np.concatenate([points_of(first) + first_shift, turned + second_shift])
+    columns = table.columns
     np.testing.assert_allclose(table.points, expected, atol=1e-12)
-    assert table.columns["scan"].tolist() == [0] * 30 + [1] * 30
-    assert table.columns["red"].dtype == np.uint8
-    np.testing.assert_array_equal(table.columns["red"][:30], first["colorRed"])
-    np.testing.assert_array_equal(table.columns["intensity"][30:], second["intensity"])
+    assert columns["scan"].tolist() == [0] * 30 + [1] * 30
+    assert columns["red"].dtype == np.uint8
+    np.testing.assert_array_equal(columns["red"][:30], first["colorRed"])
+    np.testing.assert_array_equal(columns["intensity"][30:], second["intensity"])
 
 
 def test_downsample_e57_leaves_invalid_points_out(tmp_path):

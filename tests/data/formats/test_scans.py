@@ -62,34 +62,50 @@ def test_read_bin_of_three_columns_is_refused_by_its_size(tmp_path):
         read(tmp_path / "a.bin", 9, 0)
 
 
+def rows_of_bin(path):
+    return np.fromfile(path, "<f4").reshape(-1, 5)
+
+
 def test_write_bin_keeps_the_columns_that_were_read(sweep, tmp_path):
-    path = tmp_path / "a.bin"
-    sweep.tofile(path)
+    source = tmp_path / "a.bin"
+    copy = tmp_path / "b.bin"
+    coordinates = tmp_path / "b.pcd.bin"
+    sweep.tofile(source)
+    table = read(source, 9, 0, columns=NUSCENES)
 
-    write(tmp_path / "b.bin", read(path, 9, 0, columns=NUSCENES))
-    write(tmp_path / "b.pcd.bin", read(path, 9, 0, columns=NUSCENES).without_attributes())
+    write(copy, table)
+    write(coordinates, table.without_attributes())
 
-    np.testing.assert_array_equal(np.fromfile(tmp_path / "b.bin", "<f4").reshape(-1, 5), sweep)
-    coordinates = np.fromfile(tmp_path / "b.pcd.bin", "<f4").reshape(-1, 5)
-    np.testing.assert_array_equal(coordinates, sweep * [1, 1, 1, 0, 0])
+    np.testing.assert_array_equal(rows_of_bin(copy), sweep)
+    without_attributes = sweep * [1, 1, 1, 0, 0]
+    np.testing.assert_array_equal(rows_of_bin(coordinates), without_attributes)
 
 
-@pytest.mark.parametrize("folders", [("", ""), ("velodyne", "labels")])
-def test_read_label_file_gives_class_and_instance(folders, tmp_path):
-    scans, labels = (tmp_path / folder for folder in folders)
-    scans.mkdir(exist_ok=True)
-    labels.mkdir(exist_ok=True)
+@pytest.mark.parametrize(
+    ("scans", "labels"),
+    [
+        ("", ""),
+        ("velodyne", "labels"),
+    ],
+)
+def test_read_label_file_gives_class_and_instance(scans, labels, tmp_path):
+    scan = tmp_path / scans / "000000.bin"
+    label_file = tmp_path / labels / "000000.label"
+    scan.parent.mkdir(exist_ok=True)
+    label_file.parent.mkdir(exist_ok=True)
     rows = np.random.default_rng(0).random((40, 4)).astype(np.float32)
-    rows.tofile(scans / "000000.bin")
+    rows.tofile(scan)
     classes = np.arange(40, dtype="<u4")
-    (classes + (classes + 7 << 16)).tofile(labels / "000000.label")
+    instances = classes + 7
+    packed = classes + (instances << 16)
+    packed.tofile(label_file)
 
-    table = read(scans / "000000.bin", 9, 0)
-    part = open_cloud_file(scans / "000000.bin").read(range(10, 20))
+    whole = read(scan, 9, 0).columns
+    part = open_cloud_file(scan).read(range(10, 20)).columns
 
-    assert table.columns["label"].tolist() == list(range(40))
-    assert table.columns["instance"].tolist() == list(range(7, 47))
-    assert part.columns["label"].tolist() == list(range(10, 20))
+    assert whole["label"].tolist() == list(range(40))
+    assert whole["instance"].tolist() == list(range(7, 47))
+    assert part["label"].tolist() == list(range(10, 20))
 
 
 def test_read_label_file_of_another_scan_is_refused(tmp_path):
