@@ -7,6 +7,7 @@ from mops_lightning.data.features import STORED_NORMALS
 from mops_lightning.data.formats.registry import WRITERS, read
 from mops_lightning.data.formats.table import Table
 from mops_lightning.files.column_means import renormalise
+from mops_lightning.files.compare import compare_file, options_by_method
 from mops_lightning.files.downsample import downsample_file
 from mops_lightning.files.options import Options
 
@@ -30,6 +31,22 @@ def test_normal_space_takes_points_by_the_normals_of_the_file(tmp_path):
     kept = sampled(tmp_path, {"nx": across, "nz": np.float32(across == 0)})
 
     assert np.count_nonzero(kept.columns["nx"]) == 3
+
+
+def test_compare_measures_the_points_that_downsample_keeps(tmp_path):
+    points = np.random.default_rng(0).uniform(-1, 1, (200, 3)) * [1, 1, 0]
+    across = np.zeros(200, np.float32)
+    across[[3, 50, 150]] = 1.0
+    columns = {"nx": across, "ny": np.zeros(200, np.float32), "nz": np.float32(across == 0)}
+    WRITERS[".ply"](tmp_path / "in.ply", Table(points, columns))
+
+    methods = options_by_method(6, ["normal_space"], None, None, 0)
+    compared = compare_file(tmp_path / "in.ply", 6, methods, 0)
+
+    rows = compared.results[0].rows
+    assert set(rows.tolist()) > {3, 50, 150}
+    kept = sampled(tmp_path, columns)
+    np.testing.assert_array_equal(kept.points, points[rows])
 
 
 @pytest.mark.parametrize("wrong", [0.0, np.nan])

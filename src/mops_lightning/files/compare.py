@@ -20,15 +20,18 @@ from torch import Tensor
 
 from mops_lightning.data.formats.guard import check_size
 from mops_lightning.data.formats.registry import read
+from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import UserError
 from mops_lightning.files.arguments import COMPARED
 from mops_lightning.files.downsample import SURFACE, load_sampler
 from mops_lightning.files.features import channels_for
+from mops_lightning.files.normal_columns import normals_of
 from mops_lightning.files.options import Options
 from mops_lightning.files.sample_cloud import sample_cloud
 from mops_lightning.filesystem import atomic_write
 from mops_lightning.report.page import render
 from mops_lightning.report.text import Grid, markdown
+from mops_lightning.samplers.by_normals import ByNormals
 from mops_lightning.viz.figures import INPUT, thinned
 from mops_lightning.zoo.names import UNTRAINED
 
@@ -145,9 +148,9 @@ def compare_file(
     results = []
     for name, options in methods.items():
         channels = channels_for(table, load_sampler(options).point_channels, path)
-        _warm_up(path, points, m, options, channels)
+        _warm_up(path, table, m, options, channels)
         start = time.perf_counter()
-        rows = _sample(path, points, m, options, channels)
+        rows = _sample(path, table, m, options, channels)
         seconds = time.perf_counter() - start
         error = ground_error(points[ground], points[rows[ground[rows]]]) if ground.any() else None
         results.append(Result(name, rows, *coverage(points, points[rows]), error, seconds))
@@ -192,18 +195,21 @@ def ground_error(ground: Points, kept: Points) -> float:
     return float(np.sqrt(np.square(height - ground[:, 2]).mean()))
 
 
-def _warm_up(path: Path, points: Points, m: int, options: Options, channels: Tensor | None) -> None:
+def _warm_up(path: Path, table: Table, m: int, options: Options, channels: Tensor | None) -> None:
     """Sample a few points, so that imports and compilation are in no method's time."""
-    few = np.random.default_rng(0).permutation(len(points))[: 2 * m]
+    few = np.random.default_rng(0).permutation(len(table.points))[: 2 * m]
     # A part may be unusable where the whole is not, such as one of equal points.
     with suppress(UserError):
         of_few = None if channels is None else channels[torch.from_numpy(few)]
-        _sample(path, points[few], m, options, of_few)
+        _sample(path, table.take(few), m, options, of_few)
 
 
-def _sample(path: Path, points: Points, m: int, options: Options, channels: Tensor | None) -> Rows:
+def _sample(path: Path, table: Table, m: int, options: Options, channels: Tensor | None) -> Rows:
     sampler = load_sampler(options)
-    rows, _ = sample_cloud(points, sampler, m, options, path, channels=channels)
+    normals = normals_of(table) if isinstance(sampler, ByNormals) else None
+    rows, _ = sample_cloud(
+        table.points, sampler, m, options, path, channels=channels, normals=normals
+    )
     assert rows is not None  # completed sets are rows
     return rows
 

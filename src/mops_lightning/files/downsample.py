@@ -292,19 +292,8 @@ def _rows_of_weighted(
     if options.space is not None:
         return _rows_in_space(table, m, options, source, weight), None
     sampler = load_sampler(options, m)
-    if isinstance(sampler, ByNormals) and options.tile is None:
-        return _rows_by_normals(table, sampler, m, source), None
-    return sample_cloud(table.points, sampler, m, options, source, weight, channels)
-
-
-def _rows_by_normals(table: Table, sampler: ByNormals, m: int, source: Path) -> NDArray[np.int64]:
-    """Choose points by the normals of the file, or where it has none by estimated ones."""
-    check_coordinates(source, table.points)
-    points = UnitSphere.around(table.points).normalise(table.points)[None]
-    normals = normals_of(table)
-    given = None if normals is None else torch.from_numpy(normals)[None]
-    rows: NDArray[np.int64] = sampler.rows(points, m, given)[0].numpy()
-    return rows
+    normals = normals_of(table) if isinstance(sampler, ByNormals) else None
+    return sample_cloud(table.points, sampler, m, options, source, weight, channels, normals)
 
 
 def _rows_in_space(

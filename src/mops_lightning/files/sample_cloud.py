@@ -13,6 +13,7 @@ from mops_lightning.files.features import with_channels
 from mops_lightning.files.options import Options
 from mops_lightning.ops.points import UnitSphere
 from mops_lightning.samplers.base import Sampler
+from mops_lightning.samplers.by_normals import ByNormals
 from mops_lightning.samplers.tiles import sample_by_tiles
 
 
@@ -40,6 +41,7 @@ def sample_cloud(
     source: Path,
     weight: NDArray[np.float64] | None = None,
     channels: Tensor | None = None,
+    normals: NDArray[np.float64] | None = None,
 ) -> Sampled:
     """Sample a cloud in the file's own unit.
 
@@ -51,6 +53,8 @@ def sample_cloud(
         source: the file, for errors.
         weight: ``(N,)`` above 0; None: all points are equal.
         channels: ``(N, C)``, from ``channels_for``.
+        normals: ``(N, 3)``, from ``normals_of``, for samplers by normals; None: these estimate
+            them. Tiles always do.
 
     Raises:
         UserError: the coordinates are too large, or tiles keep more points than the sampler can.
@@ -64,6 +68,9 @@ def sample_cloud(
         assert chosen is not None  # such a sampler generates no points
         return chosen[0].numpy(), None
     sphere = UnitSphere.around(points)
+    if isinstance(sampler, ByNormals):
+        given = None if normals is None else torch.from_numpy(normals)[None]
+        return sampler.rows(sphere.normalise(points)[None], m, given)[0].numpy(), None
     seen = with_channels(sphere.normalise(points), channels)
     new, found = sampler.select(options.readout, seen[None], m, weights)
     if found is not None:
