@@ -55,6 +55,16 @@ def test_verdict_of_a_sampler_that_never_wins_says_so():
     )
 
 
+def test_verdict_of_a_sampler_level_with_fps_says_so():
+    scores = {16: {"fps": [0.5], "trained": [0.5]}}
+
+    sentence = verdict(scores, ACCURACY, ["trained"])
+
+    assert sentence == (
+        "Use FPS for 16 points; your sampler is nowhere better, at best level at 16 (one draw)."
+    )
+
+
 def test_verdict_of_percentages_counts_percentage_points():
     scores = {32: {"fps": [0.40, 0.42], "fps_farthest": [0.2, 0.2], "random": [0.50, 0.54]}}
 

@@ -163,3 +163,8 @@ def test_stage_sampler_outside_a_net_is_refused(rng):
 
     with pytest.raises(UserError, match=r"inside a hierarchical net only.*sampler=mops"):
         net(points)
+
+
+def test_stage_sampler_without_a_host_says_where_it_belongs():
+    with pytest.raises(UserError, match="inside a hierarchical net only"):
+        StageMOPSNet(m=8)

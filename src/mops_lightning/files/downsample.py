@@ -26,7 +26,6 @@ from mops_lightning.files.options import Options
 from mops_lightning.files.propagate import write_map
 from mops_lightning.files.sample_cloud import Generated, Sampled, sample_cloud
 from mops_lightning.files.space import in_space
-from mops_lightning.ops.points import UnitSphere
 from mops_lightning.ops.weights import check_positive
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.by_budget import ByBudget

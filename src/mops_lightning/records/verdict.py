@@ -221,6 +221,8 @@ def _losses(advice: Sequence[Advice], called: Mapping[str, str], own: Sequence[s
     gain, m, name = max(gains, key=lambda entry: entry[0].mean)
     if gain.mean > 0:
         return [f"{called[name]} is nowhere better beyond the spread, at best {gain} at {m:,}"]
+    if gain.mean == 0:
+        return [f"{called[name]} is nowhere better, at best level at {m:,}"]
     return [f"{called[name]} is nowhere better, at best {gain} worse at {m:,}"]
 
 

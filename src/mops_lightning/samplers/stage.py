@@ -17,6 +17,11 @@ from mops_lightning.samplers.local import LocalAnchors
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.types import SampleOutput
 
+INSIDE_ONLY = (
+    "StageMOPSNet samples inside a hierarchical net only, whose features it reads "
+    "(sampler@task.net.sampler=mops_stage). Choose sampler=mops outside."
+)
+
 
 class StageMOPSNet(MOPSNet):
     """MOPS-Net with local columns, whose keys are computed from the features of its host.
@@ -28,7 +33,7 @@ class StageMOPSNet(MOPSNet):
 
     Args:
         m: largest number of points; of a cloud with fewer points, all are returned.
-        channels: of the host's features.
+        channels: of the host's features; the host gives their number.
         alpha: weight of the subset loss.
         tau_min: temperature at the end of training and in evaluation.
         key_channels: C, of the keys.
@@ -38,7 +43,7 @@ class StageMOPSNet(MOPSNet):
         neighbours: see ``MOPSNet``.
 
     Raises:
-        UserError: an argument is out of range.
+        UserError: an argument is out of range, or there is no host.
 
     Examples:
         >>> import torch
@@ -54,7 +59,7 @@ class StageMOPSNet(MOPSNet):
     def __init__(
         self,
         m: int,
-        channels: int,
+        channels: int | None = None,
         alpha: float = 30.0,
         tau_min: float = 0.1,
         key_channels: int = 32,
@@ -63,6 +68,8 @@ class StageMOPSNet(MOPSNet):
         candidates: int | None = None,
         neighbours: int | None = 16,
     ) -> None:
+        if channels is None:
+            raise UserError(INSIDE_ONLY)
         super().__init__(
             m,
             alpha,
@@ -79,10 +86,7 @@ class StageMOPSNet(MOPSNet):
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Refuse points without features."""
-        raise UserError(
-            "StageMOPSNet samples inside a hierarchical net only, whose features it reads. Choose "
-            "sampler=mops outside."
-        )
+        raise UserError(INSIDE_ONLY)
 
     def by_features(self, points: Tensor, features: Tensor, m: int) -> SampleOutput:
         """Generate m of the points ``(B, N, 3)`` with features ``(B, N, channels)``; no losses."""

@@ -28,6 +28,9 @@ def loss(output, batch):
 
 def two_numbers(output, batch):
     return torch.zeros(2)
+
+def missing(output, batch):
+    return output.sum() * float("nan")
 """
 
 
@@ -251,8 +254,17 @@ def test_net_of_ones_own_with_a_mistake_is_refused(scans, tmp_path, monkeypatch)
     assert "must be a torch.nn.Module" in said(
         f"{module}.torch.manual_seed.__doc__", f"{module}.loss"
     )
-    assert "cannot import" in said(f"{module}.Net", f"{module}.missing")
+    assert f"{module} has no 'los'. Did you mean 'loss'?" in said(f"{module}.Net", f"{module}.los")
     assert "one for each of" in said(f"{module}.Net", f"{module}.two_numbers")
+    assert "the loss of Net must be finite; from all points it is nan" in said(
+        f"{module}.Net", f"{module}.missing"
+    )
+
+
+def test_net_of_ones_own_without_a_loss_is_told_of_it(scans, tmp_path):
+    given = [scans, "--task-net", "my_net.build", "--m", 8, "--out", tmp_path / "out"]
+
+    assert "A net of your own needs --loss, too." in refused(compare, given)
 
 
 def test_saved_sampler_is_not_replaced_without_overwrite(own_scans, scans, tmp_path):

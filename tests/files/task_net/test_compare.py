@@ -53,6 +53,21 @@ def test_scores_of_a_module_are_the_mean_losses_of_the_chosen_points(scans):
     assert result.saved is None
 
 
+def test_methods_with_the_same_mean_are_all_bold(scans):
+    def constant(output, batch):
+        return output.sum() * 0 + 2.0
+
+    result = compare_task_net(scans, Extent(), [8], loss=constant, **SMALL)
+
+    rows = [line for line in result.text.splitlines() if line.startswith("| ")][1:]
+    assert rows == [
+        "| fps | **2.000** ± 0.000 |",
+        "| random | **2.000** ± 0.000 |",
+        "| fps_farthest | **2.000** ± 0.000 |",
+        "| all points | 2.000 ± 0.000 |",
+    ]
+
+
 def test_samplers_in_memory_are_compared_and_not_saved(scans, tmp_path):
     samplers = [FMOPSNet(16), FMOPSNet(8)]
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from math import isfinite
 from typing import Any
 
 import torch
@@ -65,6 +66,7 @@ class Tally:
     """Sums up the results of one method at one size for one group of files."""
 
     def __init__(self, subject: Subject) -> None:
+        self.net = subject.name
         metrics = subject.task.metrics()
         self.metric: Metric | None = metrics[subject.task.score] if len(metrics) else None
         self.total = 0.0
@@ -78,10 +80,21 @@ class Tally:
             self.metric.update(result.predictions, result.targets)
 
     def score(self, draw: int, files: str, key: Key) -> Score:
-        """Return the means over all batches."""
+        """Return the means over all batches.
+
+        Raises:
+            UserError: the loss or the score is not finite.
+        """
         method, m = key
         loss = self.total / self.clouds
         value = loss if self.metric is None else float(self.metric.compute())
+        points = f"{m:,} points by {method}" if m else method
+        for what, number in {"loss": loss, "score": value}.items():
+            if not isfinite(number):
+                raise UserError(
+                    f"--task-net: the {what} of {self.net} must be finite; from {points} it is "
+                    f"{number}."
+                )
         return Score(draw, files, m, method, loss, value, self.clouds)
 
 

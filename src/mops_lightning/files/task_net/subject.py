@@ -11,7 +11,7 @@ from torchmetrics import MetricCollection
 
 from mops_lightning.channels import NO_CHANNELS, PointChannels
 from mops_lightning.data.crops import Crop
-from mops_lightning.errors import UserError, check_at_least
+from mops_lightning.errors import UserError, check_at_least, did_you_mean
 from mops_lightning.tasks.base import Task
 from mops_lightning.types import Batch, TaskOutput
 
@@ -120,7 +120,8 @@ def subject_of_run(
     try:
         trained = read_task(reference)
     except UserError as error:
-        raise UserError(f"--task-net: {error}") from None
+        hint = "" if Path(reference).exists() else " A net of your own needs --loss, too."
+        raise UserError(f"--task-net: {error}{hint}") from None
     data = trained.config["dataset"]
     # Tiles are neighbourhoods, too, but always the same ones.
     crop: Crop = "nearest" if data.get("crop") in ("nearest", "tiles") else "whole"
@@ -204,6 +205,9 @@ def imported(name: str, option: str) -> Any:
         return get_object(name)
     except Exception as error:
         reason = str(error.__cause__ or error).strip().splitlines()[-1]
+        module, _, last = name.rpartition(".")
+        if module in sys.modules:  # Hydra then says that the module is no package
+            reason = f"{module} has no {last!r}.{did_you_mean(last, vars(sys.modules[module]))}"
         raise UserError(f"{option}: cannot import {name!r}: {reason}") from None
 
 

@@ -118,7 +118,7 @@ class Comparison:
             row: list[str | Cell] = [method]
             for m in sizes:
                 values = of_method[of_method.m == (0 if method == EVERYTHING else m)][column]
-                rank = BEST if method == best[m] else 0
+                rank = BEST if method in best[m] else 0
                 row.append(_cell(values.tolist(), metric, rank))
             rows.append(row)
         rows.sort(key=lambda row: row[0] == EVERYTHING)
@@ -154,10 +154,11 @@ class Comparison:
         return figure
 
 
-def _best(frame: pd.DataFrame, column: str, metric: MetricInfo) -> str:
-    """Return the method with the best mean."""
+def _best(frame: pd.DataFrame, column: str, metric: MetricInfo) -> set[str]:
+    """Return the method with the best mean, or all methods that share it."""
     means = frame.groupby("method", sort=False)[column].mean()
-    return str(means.idxmax() if metric.higher_is_better else means.idxmin())
+    best = means.max() if metric.higher_is_better else means.min()
+    return set(means.index[means == best])
 
 
 def _spread(values: Sequence[float]) -> float:
