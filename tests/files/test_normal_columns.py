@@ -37,7 +37,8 @@ def test_compare_measures_the_points_that_downsample_keeps(tmp_path):
     points = np.random.default_rng(0).uniform(-1, 1, (200, 3)) * [1, 1, 0]
     across = np.zeros(200, np.float32)
     across[[3, 50, 150]] = 1.0
-    columns = {"nx": across, "ny": np.zeros(200, np.float32), "nz": (across == 0).astype(np.float32)}
+    up = (across == 0).astype(np.float32)
+    columns = {"nx": across, "ny": np.zeros(200, np.float32), "nz": up}
     WRITERS[".ply"](tmp_path / "in.ply", Table(points, columns))
 
     methods = options_by_method(6, ["normal_space"], None, None, 0)
