@@ -75,29 +75,45 @@ def columns_backward(
     """Add the gradients of ``columns`` to the gradients of its arguments."""
     clouds, m, k = weights.shape
     rate = weights.dtype.type(1 / tau)
-    rate = weights.dtype.type(1 / tau)
+    given = np.empty(k, weights.dtype)  # the gradients of the logits of a column
     for cloud in range(clouds):
         for j in range(m):
-            query, anchor = queries[cloud, j], anchors[cloud, j]
             mean = weights.dtype.type(0)
             for t in range(k):
                 mean += weights[cloud, j, t] * gradients[cloud, j, t]
             for t in range(k):
-                given = weights[cloud, j, t] * (gradients[cloud, j, t] - mean) * rate
-                place = places[cloud, j, t]
-                key, key_gradient = keys[cloud, place], key_gradients[cloud, place]
-                query_gradient = query_gradients[cloud, j]
+                given[t] = weights[cloud, j, t] * (gradients[cloud, j, t] - mean) * rate
+            query, query_gradient = queries[cloud, j], query_gradients[cloud, j]
+            for t in range(k):
+                key = keys[cloud, places[cloud, j, t]]
                 for c in range(len(query)):
-                    query_gradient[c] += given * key[c]
-                    key_gradient[c] += given * query[c]
-                square = weights.dtype.type(0)
-                factor = weights.dtype.type(-2) * sharpness[cloud, j] * given
-                for axis in range(points.shape[2]):
-                    apart = points[cloud, place, axis] - points[cloud, anchor, axis]
-                    square += apart * apart
-                    point_gradients[cloud, place, axis] += factor * apart
-                    point_gradients[cloud, anchor, axis] -= factor * apart
-                sharpness_gradients[cloud, j] -= given * square
+                    query_gradient[c] += given[t] * key[c]
+            for t in range(k):
+                key_gradient = key_gradients[cloud, places[cloud, j, t]]
+                for c in range(len(query)):
+                    key_gradient[c] += given[t] * query[c]
+            factor = weights.dtype.type(-2) * sharpness[cloud, j]
+            anchor = anchors[cloud, j]
+            ax, ay, az = (
+                points[cloud, anchor, 0],
+                points[cloud, anchor, 1],
+                points[cloud, anchor, 2],
+            )
+            gx = gy = gz = total = weights.dtype.type(0)
+            for t in range(k):
+                place, share = places[cloud, j, t], factor * given[t]
+                x = points[cloud, place, 0] - ax
+                y = points[cloud, place, 1] - ay
+                z = points[cloud, place, 2] - az
+                point_gradients[cloud, place, 0] += share * x
+                point_gradients[cloud, place, 1] += share * y
+                point_gradients[cloud, place, 2] += share * z
+                gx, gy, gz = gx + share * x, gy + share * y, gz + share * z
+                total += given[t] * (x * x + y * y + z * z)
+            point_gradients[cloud, anchor, 0] -= gx
+            point_gradients[cloud, anchor, 1] -= gy
+            point_gradients[cloud, anchor, 2] -= gz
+            sharpness_gradients[cloud, j] -= total
 
 
 @jit_sums

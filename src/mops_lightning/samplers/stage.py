@@ -62,7 +62,7 @@ class StageMOPSNet(MOPSNet):
         channels: int | None = None,
         alpha: float = 30.0,
         tau_min: float = 0.1,
-        key_channels: int = 32,
+        key_channels: int = 16,
         anchor_width: float = 0.5,
         overlap: float = 0.0,
         candidates: int | None = None,
