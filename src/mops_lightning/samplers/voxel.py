@@ -87,7 +87,7 @@ def fullest_voxels(points: Tensor, m: int) -> list[NDArray[np.int64]]:
     exact = on_cpu.double().contiguous().numpy()
     hashes = compiled_hashes(on_cpu, 0).view(np.int64)
     spans = _spans(on_cpu)
-    scales = _scales(spans, m)
+    scales = [_scale(cloud, m) for cloud in spans]
     return [_fullest(*cloud) for cloud in zip(exact, spans, scales, hashes, strict=True)]
 
 
@@ -111,24 +111,29 @@ def _spans(points: Tensor) -> list[Positions]:
     return [voxel_search.in_unit_cube(cloud.ravel(), tiny) for cloud in exact]
 
 
-def _scales(spans: list[Positions], m: int) -> Positions:
-    """Return the smallest number of voxels per side with at least m occupied voxels."""
-    searches = [_Search(cloud, m) for cloud in spans]
-    coarse = np.full(len(spans), COARSEST, spans[0].dtype)
-    fine = np.full(len(spans), FINEST, spans[0].dtype)
+def _scale(spans: Positions, m: int) -> np.floating:
+    """Return the smallest number of voxels per side with at least m occupied voxels.
+
+    Args:
+        spans: ``(3·N,)`` positions of a cloud in the unit cube.
+        m: smallest number of voxels.
+    """
+    search = _Search(spans, m)
+    coarse, fine = spans.dtype.type(COARSEST), spans.dtype.type(FINEST)
     for _ in range(BISECTIONS):
         middle = (coarse + fine) / 2
-        pairs = zip(searches, _powers_of_two(middle), strict=True)
-        is_enough = np.array([search.reaches(scale) for search, scale in pairs])
-        fine = np.where(is_enough, middle, fine)
-        coarse = np.where(is_enough, coarse, middle)
-    return _powers_of_two(fine)
+        if search.reaches(_power_of_two(middle)):
+            fine = middle
+        else:
+            coarse = middle
+    return _power_of_two(fine)
 
 
-def _powers_of_two(exponents: Positions) -> Positions:
+def _power_of_two(exponent: np.floating) -> np.floating:
     """Return 2ˣ as torch rounds it, which differs from NumPy's in the last bit."""
-    powers: Positions = torch.from_numpy(exponents).exp2().numpy()
-    return powers
+    powers = torch.from_numpy(np.array([exponent])).exp2_().numpy()
+    power: np.floating = powers[0]
+    return power
 
 
 class _Search:
