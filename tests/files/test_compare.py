@@ -114,6 +114,8 @@ def test_compare_measures_the_ground_of_airborne_scans_only(tmp_path):
     assert of_airborne.results[0].ground == pytest.approx(0, abs=1e-6)
     assert of_other.results[0].ground is None
     assert table.count("| ground |") == 1
+    assert "- ground: " in table
+    assert "- ground: " not in compare.write_comparison([of_other], tmp_path / "one")
     lines = (tmp_path / "table.csv").read_text().split()
     head, airborne_ground, other_ground = [line.split(",")[7] for line in lines]
     assert head != ""

@@ -54,10 +54,13 @@ MEANINGS = [
     "largest one.",
     "- density: standard deviation over mean of the number of input points per kept point. At 0 "
     "the sample has the density of the input; even sampling of an uneven scan has a high value.",
-    "- ground: root mean square error of the heights of all ground points (class 2 of airborne "
-    "scans) on the surface through the kept ground points.",
     "- seconds: time of the sampling alone, on this machine.",
 ]
+
+MEANING_OF_GROUND = (
+    "- ground: root mean square error of the heights of all ground points (class 2 of airborne "
+    "scans) on the surface through the kept ground points."
+)
 
 
 @dataclass(frozen=True)
@@ -218,11 +221,14 @@ def write_comparison(results: Sequence[FileResult], folder: Path) -> str:
     """Write the table and the page, and return the table as text."""
     grids = [_grid(result) for result in results]
     clouds = [_clouds(result) for result in results]
-    page = render("compare", grids, clouds, MEANINGS, "How to read this", choice="File")
+    meanings = list(MEANINGS)
+    if any("ground" in grid.head for grid in grids):
+        meanings.append(MEANING_OF_GROUND)
+    page = render("compare", grids, clouds, meanings, "How to read this", choice="File")
     for name, content in zip(COMPARED, (_csv(results), page), strict=True):
         with atomic_write(folder / name) as temporary:
             temporary.write_text(content, encoding="utf-8")
-    return markdown(grids, MEANINGS)
+    return markdown(grids, meanings)
 
 
 def _grid(compared: FileResult) -> Grid:

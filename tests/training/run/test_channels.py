@@ -178,10 +178,20 @@ def test_pictures_take_the_colours_of_a_channel(folder, tmp_path):
     assert left.sum() > 50  # the input, which is grey otherwise
 
 
-def test_colour_of_an_unknown_channel_is_refused(folder):
-    line = refused([*SETTINGS, "pictures=1", "callbacks.pictures.colour=ring"], folder)
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ([], "Allowed: intensity, normal_x,"),
+        (["dataset.features=null"], "x, y and z only. dataset.features gives them channels."),
+    ],
+)
+def test_colour_of_an_unknown_channel_is_refused(settings, said, folder):
+    picture = ["pictures=1", "callbacks.pictures.colour=ring"]
 
-    assert "callbacks.pictures.colour: no channel 'ring'. Allowed: intensity, normal_x," in line
+    line = refused([*SETTINGS, *picture, *settings], folder)
+
+    assert "callbacks.pictures.colour: no channel 'ring'" in line
+    assert said in line
 
 
 def test_net_without_channels_is_refused(folder):

@@ -61,6 +61,11 @@ class CloudVisualization(Callback):
         axis = "y" if isinstance(up, bool) else up
         if axis not in drawing.VIEWS:
             raise UserError(f"up must be x, y or z (the vertical axis), got {up!r:.99}.")
+        if colour is not None and not channels:
+            raise UserError(
+                f"colour: no channel {colour!r}: the points have x, y and z only. dataset.features "
+                "gives them channels."
+            )
         if colour is not None and colour not in channels.names:
             raise UserError(f"colour: no channel {colour!r}.{did_you_mean(colour, channels.names)}")
         self.up = axis
