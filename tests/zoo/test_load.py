@@ -4,7 +4,8 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from mops_lightning import FMOPSNet, SampleOutput, Sampler, load
+from mops_lightning import FMOPSNet, FPSSampler, SampleOutput, Sampler, load
+from mops_lightning.channels import Channel, PointChannels
 from mops_lightning.config.groups import conf_dir
 from mops_lightning.errors import UserError
 from mops_lightning.nets.pointnet import PointNetVanilla
@@ -39,6 +40,19 @@ def test_load_file_or_folder_gives_the_saved_sampler(save):
         assert not sampler.training
         with torch.no_grad():
             assert torch.equal(sampler(points, 5).points, saved(points, 5).points)
+
+
+def test_load_of_a_sampler_that_sees_no_channels_takes_them_along(tmp_path):
+    node = {"_target_": "mops_lightning.samplers.fps.FPSSampler", "m": 4, "start": "farthest"}
+    config = {"learn": "joint", "sampler": node}
+    channels = PointChannels([Channel("intensity", 100.0, 50.0)])
+    weights.save(tmp_path / weights.FILE, FPSSampler(4), config, {}, channels=channels)
+    cloud = torch.rand(40, 4)
+
+    points, rows = load(tmp_path).downsample(cloud)
+
+    assert torch.equal(points, cloud[rows])
+    assert torch.equal(rows, FPSSampler(4, start="farthest").downsample(cloud)[1])
 
 
 def test_load_net_gives_the_saved_task_net(tmp_path):

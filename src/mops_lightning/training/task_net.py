@@ -60,7 +60,9 @@ def read_task(reference: str) -> TrainedTask:
     cfg = as_trained(compose(trained.choices()), trained, trained.choices())
     task = build_task(cfg, outputs, content["channels"])
     weights.fit_state(task, content["state"], path)
-    sampler = None if is_task_net else weights.of_run(trained.path)
+    sampler = None
+    if not is_task_net and weights.read(weights.of_run(trained.path))["state"]:
+        sampler = weights.of_run(trained.path)
     return TrainedTask(
         task.eval().requires_grad_(False),
         tuple(content["classes"]),

@@ -92,7 +92,8 @@ def load(path: str | Path, cls: type[Sampler] | None = None) -> Sampler:
             f"{_target(node)!r:.99}. For a sampler of your own, give load() its class: "
             "load(path, cls=MySampler)."
         )
-    node = _with_channels(node, content["channels"])
+    if "point_channels" in signature(found).parameters:
+        node = _with_channels(node, content["channels"])
     return _build(found, node, content["state"], path, "sampler", HINT)
 
 

@@ -12,7 +12,7 @@ from mops_lightning.files.cli import compare
 from mops_lightning.files.downsample_cli import downsample
 from mops_lightning.samplers.by_budget import ByBudget
 from mops_lightning.zoo.names import UNTRAINED
-from tests.files.task_net.conftest import write_clouds
+from tests.files.task_net.conftest import trained, write_clouds
 from tests.support.captured import captured, done, refused
 
 NET = """
@@ -89,6 +89,23 @@ def test_segmentation_takes_parts_from_the_column_of_training(segmenter, tmp_pat
 
     assert "mean IoU (%)" in out
     assert set(frame[frame.files == "all"].clouds) == {4}
+
+
+def test_net_trained_jointly_on_farthest_points_has_no_sampler_of_its_own(tmp_path):
+    data = write_clouds(tmp_path / "data", 2, seed=7, parts=True)
+    net = ["task.net.points=[16,8]", "task.net.channels=[4,8,8]", "task.net.k=4"]
+    parts = ["task=segmentation", "dataset.label=part", "dataset.features=[curvature]", *net]
+    joint = ["learn=joint", "weights=null", "sampler=fps", "m=16", "epochs.joint=1"]
+    run = trained(tmp_path, [f"dataset.root={data}", *parts, *joint])
+    scans = write_clouds(tmp_path / "scans", 2, seed=8, parts=True)
+
+    _, frame = compared(
+        scans, "--task-net", run, "--m", 16, "--draws", 1, "--methods", "random", "--crops", 1,
+        "--out", tmp_path / "out",
+    )  # fmt: skip
+
+    assert set(frame.method) == {"all points", "fps", "fps_farthest", "random"}
+    assert load(run).m == 16
 
 
 def test_registration_by_a_model_counts_pairs(scans, tmp_path):
