@@ -37,11 +37,17 @@ def approximate_assignment(p: Array, q: Array, block: int, rounds: int) -> Rows:
     """
     assigned = _assign_by_bisection(p, q, block)
     rng = np.random.default_rng(0)
-    for number in range(rounds if len(p) > block else 0):
+    if len(p) <= block:
+        return assigned
+    for number in range(rounds):
         rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-        positions = (q[assigned] if number % 2 else p) @ rotation
-        for rows in _split_into_blocks(positions, block):
-            assigned[rows] = assigned[rows[solve_assignment(p[rows], q[assigned[rows]])]]
+        positions = p
+        if number % 2:
+            positions = q[assigned]
+        for rows in _split_into_blocks(positions @ rotation, block):
+            partners = assigned[rows]
+            order = solve_assignment(p[rows], q[partners])
+            assigned[rows] = partners[order]
     return assigned
 
 
@@ -63,7 +69,8 @@ def solve_assignment(p: Array, q: Array) -> Rows:
         from ot import emd
 
         weights = np.full(len(p), 1 / len(p))
-        rows = np.asarray(emd(weights, weights, cost, numItermax=10**8)).argmax(1)
+        plan = np.asarray(emd(weights, weights, cost, numItermax=10**8))
+        rows = plan.argmax(1)
         # A vertex of the transport polytope is a bijection, except for rounding errors.
         if len(np.unique(rows)) == len(p):
             return rows.astype(np.int64)
@@ -73,27 +80,33 @@ def solve_assignment(p: Array, q: Array) -> Rows:
 def _assign_by_bisection(p: Array, q: Array, block: int) -> Rows:
     """Split both clouds at their medians until parts have at most ``block`` points; solve these."""
     assigned = np.empty(len(p), np.int64)
-    stack = [(np.arange(len(p)), np.arange(len(q)))]
+    all_rows = np.arange(len(p))
+    stack = [(all_rows, np.arange(len(q)))]
     while stack:
         p_rows, q_rows = stack.pop()
         if len(p_rows) <= block:
-            assigned[p_rows] = q_rows[solve_assignment(p[p_rows], q[q_rows])]
+            order = solve_assignment(p[p_rows], q[q_rows])
+            assigned[p_rows] = q_rows[order]
             continue
-        axis = int(np.concatenate([p[p_rows], q[q_rows]]).var(0).argmax())
-        halves = (_split_at_median(p[:, axis], p_rows), _split_at_median(q[:, axis], q_rows))
-        stack += zip(*halves, strict=True)
+        points = np.concatenate([p[p_rows], q[q_rows]])
+        axis = int(points.var(0).argmax())
+        p_halves = _split_at_median(p[:, axis], p_rows)
+        q_halves = _split_at_median(q[:, axis], q_rows)
+        stack += zip(p_halves, q_halves, strict=True)
     return assigned
 
 
 def _split_into_blocks(positions: Array, block: int) -> list[Rows]:
     """Split ``(N, 3)`` points across their longest sides into sets of at most ``block`` rows."""
-    blocks, stack = [], [np.arange(len(positions))]
+    blocks = []
+    stack = [np.arange(len(positions))]
     while stack:
         rows = stack.pop()
         if len(rows) <= block:
             blocks.append(rows)
         else:
-            axis = int(np.ptp(positions[rows], axis=0).argmax())
+            extents = np.ptp(positions[rows], axis=0)
+            axis = int(extents.argmax())
             stack += _split_at_median(positions[:, axis], rows)
     return blocks
 

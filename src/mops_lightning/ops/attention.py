@@ -34,7 +34,10 @@ class Blocks(NamedTuple):
     points: int
 
 
-BLOCKS = {"cpu": Blocks(2**22, 2048, 512), "cuda": Blocks(2**26, 4096, 2**14)}
+BLOCKS = {
+    "cpu": Blocks(dense=2**22, queries=2048, points=512),
+    "cuda": Blocks(dense=2**26, queries=4096, points=2**14),
+}
 """On a CPU, the logits of a block (4 MiB in float32) fit into the last-level cache, and its keys
 into the second-level cache. On a GPU, a block keeps the whole device busy."""
 
@@ -46,7 +49,8 @@ def blocks_on(device: torch.device) -> Blocks:
 
 def slices(total: int, size: int) -> list[slice]:
     """Split ``range(total)`` into slices of at most ``size``."""
-    return [slice(start, min(start + size, total)) for start in range(0, total, size)]
+    starts = range(0, total, size)
+    return [slice(start, min(start + size, total)) for start in starts]
 
 
 def softmax_weights(powers: Tensor, keys: Tensor, level: Tensor) -> Tensor:
@@ -61,7 +65,8 @@ def softmax_weights(powers: Tensor, keys: Tensor, level: Tensor) -> Tensor:
         ``(M, N)``.
     """
     with full_precision(keys.device.type):
-        return (powers @ keys.mT).sub_(level[:, None]).exp2_()
+        logits = powers @ keys.mT
+        return logits.sub_(level[:, None]).exp2_()
 
 
 class Partial(NamedTuple):
@@ -83,12 +88,11 @@ class Partial(NamedTuple):
     def merge(self, other: "Partial") -> "Partial":
         """Return the sum over the points of both; the order of merging affects rounding only."""
         level = torch.maximum(self.level, other.level)
-        mine, theirs = (self.level - level).exp2(), (other.level - level).exp2()
-        return Partial(
-            level,
-            self.total * mine + other.total * theirs,
-            self.weighted * mine[:, None] + other.weighted * theirs[:, None],
-        )
+        mine = (self.level - level).exp2()
+        theirs = (other.level - level).exp2()
+        total = self.total * mine + other.total * theirs
+        weighted = self.weighted * mine[:, None] + other.weighted * theirs[:, None]
+        return Partial(level, total, weighted)
 
     def result(self) -> Tensor:
         """Return the weighted mean ``(M, V)``."""
@@ -113,8 +117,10 @@ def attend(queries: Tensor, keys: Tensor, values: Tensor) -> Partial:
     """
     powers = queries * LOG2_E
     # The column of ones gives the sum of the weights. Contiguous columns halve the product's time.
-    extended = torch.cat([values.mT, values.new_ones(1, len(values))]).mT
-    probes = keys[:: max(len(keys) // PROBES, 1)]
+    ones = values.new_ones(1, len(values))
+    extended = torch.cat([values.mT, ones]).mT
+    stride = max(len(keys) // PROBES, 1)
+    probes = keys[::stride]
     # Sums up to this limit can be merged, and multiplied by a value of the same size.
     limit = math.sqrt(torch.finfo(extended.dtype).max)
     level = powers.new_empty(len(powers))
@@ -124,22 +130,30 @@ def attend(queries: Tensor, keys: Tensor, values: Tensor) -> Partial:
             block = powers[columns]
             estimate = (block @ probes.mT).amax(1)
             total = _sums(block, keys, extended, estimate)
-            unsure = ~((total[:, -1] > 0.5) & (total[:, -1] < limit))
+            weight_sums = total[:, -1]
+            is_safe = (weight_sums > 0.5) & (weight_sums < limit)
+            unsure = ~is_safe
             if unsure.any():
-                estimate[unsure], total[unsure] = _sums_from_maxima(block[unsure], keys, extended)
-            level[columns], sums[columns] = estimate, total
-    return Partial(level, sums[:, -1], sums[:, :-1])
+                exact_level, exact_total = _sums_from_maxima(block[unsure], keys, extended)
+                estimate[unsure] = exact_level
+                total[unsure] = exact_total
+            level[columns] = estimate
+            sums[columns] = total
+    return Partial(level, total=sums[:, -1], weighted=sums[:, :-1])
 
 
 def _sums(powers: Tensor, keys: Tensor, extended: Tensor, level: Tensor) -> Tensor:
     """Return the sums of ``extended`` with the weights 2^(⟨power, key⟩ − level)."""
     blocks = slices(len(keys), blocks_on(keys.device).points)
     result = extended.new_zeros(len(powers), extended.shape[1])
-    buffer = keys.new_empty(len(powers) * (blocks[0].stop - blocks[0].start))
+    largest = blocks[0].stop - blocks[0].start
+    buffer = keys.new_empty(len(powers) * largest)
+    offset = -level[:, None]
     for rows in blocks:
         shape = (len(powers), rows.stop - rows.start)
         out = buffer[: math.prod(shape)].view(shape)
-        weights = torch.addmm(-level[:, None], powers, keys[rows].mT, out=out).exp2_()
+        logits = torch.addmm(offset, powers, keys[rows].mT, out=out)
+        weights = logits.exp2_()
         # addmm_ would accumulate over all points one by one, which loses precision.
         result += weights @ extended[rows]
     return result
@@ -151,16 +165,22 @@ def _sums_from_maxima(powers: Tensor, keys: Tensor, extended: Tensor) -> tuple[T
     for rows in slices(len(keys), blocks_on(keys.device).points):
         logits = powers @ keys[rows].mT
         peak = logits.amax(1)
-        sums = logits.sub_(peak[:, None]).exp2_() @ extended[rows]
+        weights = logits.sub_(peak[:, None]).exp2_()
+        sums = weights @ extended[rows]
         part = Partial(peak, sums[:, -1], sums)
-        merged = part if merged is None else merged.merge(part)
+        if merged is None:
+            merged = part
+        else:
+            merged = merged.merge(part)
     assert merged is not None
     return merged.level, merged.weighted
 
 
 def per_cloud(queries: Tensor, clouds: int) -> list[Tensor]:
     """Return the queries ``(M, C)`` of every cloud: views of ``(M, C)`` or ``(B, M, C)``."""
-    return [queries] * clouds if queries.ndim == 2 else list(queries)
+    if queries.ndim == 2:
+        return [queries] * clouds
+    return list(queries)
 
 
 def attend_batch(queries: Tensor, keys: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
@@ -174,10 +194,12 @@ def attend_batch(queries: Tensor, keys: Tensor, values: Tensor) -> tuple[Tensor,
     Returns:
         ``(B, M, V)``, and ``(B, M)`` to the base 2; without gradients.
     """
-    clouds = zip(per_cloud(queries, len(keys)), keys, values, strict=True)
+    queries_of_each = per_cloud(queries, len(keys))
+    clouds = zip(queries_of_each, keys, values, strict=True)
     sums = [attend(*cloud) for cloud in clouds]
     results = torch.stack([cloud.result() for cloud in sums])
-    return results, torch.stack([cloud.level + cloud.total.log2() for cloud in sums])
+    log_sums = torch.stack([cloud.level + cloud.total.log2() for cloud in sums])
+    return results, log_sums
 
 
 def streamed_attention(queries: Tensor, keys: Tensor, values: Tensor) -> Tensor:
@@ -206,24 +228,30 @@ class _StreamedAttention(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         queries, keys, values, result, log_sum = ctx.saved_tensors
         (grad,) = grads
-        grad_queries, grad_keys = torch.zeros_like(queries), torch.zeros_like(keys)
+        grad_queries = torch.zeros_like(queries)
+        grad_keys = torch.zeros_like(keys)
         grad_values = torch.zeros_like(values)
         # Backward pass of the softmax: dS = S ∘ (dA − ⟨dQ, Q⟩), with dA = dQ·Pᵀ.
         inner = (grad * result).sum(-1)
-        clouds, size = len(keys), blocks_on(keys.device)
-        each, powers = per_cloud(queries, clouds), per_cloud(queries * LOG2_E, clouds)
+        clouds = len(keys)
+        size = blocks_on(keys.device)
+        each = per_cloud(queries, clouds)
+        powers = per_cloud(queries * LOG2_E, clouds)
         grad_each = per_cloud(grad_queries, clouds)
         for cloud in range(clouds):
             for columns in slices(queries.shape[-2], size.queries):
+                given = grad[cloud, columns]
+                level = log_sum[cloud, columns]
+                inner_columns = inner[cloud, columns, None]
                 for rows in slices(keys.shape[1], size.points):
                     key = keys[cloud, rows]
-                    level = log_sum[cloud, columns]
                     weights = softmax_weights(powers[cloud][columns], key, level)
                     if ctx.needs_input_grad[2]:
                         # A few rows on the left are faster than a few columns on the right.
-                        grad_values[cloud, rows] += (grad[cloud, columns].mT @ weights).mT
-                    change = grad[cloud, columns] @ values[cloud, rows].mT
-                    change.sub_(inner[cloud, columns, None]).mul_(weights)
+                        grad_of_values = given.mT @ weights
+                        grad_values[cloud, rows] += grad_of_values.mT
+                    change = given @ values[cloud, rows].mT
+                    change.sub_(inner_columns).mul_(weights)
                     grad_each[cloud][columns] += change @ key
                     grad_keys[cloud, rows] += change.mT @ each[cloud][columns]
         return grad_queries, grad_keys, grad_values

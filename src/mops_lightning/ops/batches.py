@@ -24,7 +24,8 @@ def cloud_sizes(number: int, batch: NDArray[Any], name: str = "batch") -> NDArra
         )
     if number:
         is_negative = batch[0] < 0
-        descends = bool((batch[1:] < batch[:-1]).any())
+        falls = batch[1:] < batch[:-1]
+        descends = bool(falls.any())
         if is_negative or descends:
             raise UserError(f"{name} must be ascending and at least 0. Sort the points by cloud.")
     return np.bincount(batch.astype(np.int64))

@@ -27,18 +27,26 @@ def same_sum(vectors: Vectors, keep: int) -> tuple[NDArray[np.int64], Weights]:
         is N.
     """
     largest = np.abs(vectors).max(0, initial=0.0)
-    scaled = vectors / np.where(largest > 0, largest, 1.0)
-    extended = np.column_stack([scaled, np.ones(len(scaled))])
+    divisors = np.where(largest > 0, largest, 1.0)
+    scaled = vectors / divisors
+    ones = np.ones(len(scaled))
+    extended = np.column_stack([scaled, ones])
     rows = np.arange(len(extended))
     weights = np.ones(len(extended))
     while len(rows) > keep:
-        clusters = np.array_split(np.arange(len(rows)), min(len(rows), 2 * keep))
+        number = min(len(rows), 2 * keep)
+        clusters = np.array_split(np.arange(len(rows)), number)
         starts = np.array([cluster[0] for cluster in clusters])
-        sums = np.add.reduceat(weights[:, None] * extended[rows], starts)
+        sizes = [len(cluster) for cluster in clusters]
+        weighted = weights[:, None] * extended[rows]
+        sums = np.add.reduceat(weighted, starts)
         factors = _reduced(sums, keep)
-        weights *= np.repeat(factors, [len(cluster) for cluster in clusters])
-        rows, weights = rows[weights > 0], weights[weights > 0]
-    return rows, _corrected(extended[rows], weights, extended.sum(0))
+        weights *= np.repeat(factors, sizes)
+        is_kept = weights > 0
+        rows = rows[is_kept]
+        weights = weights[is_kept]
+    total = extended.sum(0)
+    return rows, _corrected(extended[rows], weights, total)
 
 
 def _reduced(vectors: Vectors, keep: int) -> Weights:
@@ -48,14 +56,19 @@ def _reduced(vectors: Vectors, keep: int) -> Weights:
     is left out: a reflection of the orthonormal basis leaves all but one direction 0 there.
     """
     factors = np.ones(len(vectors))
-    null = np.linalg.svd(vectors.T, full_matrices=True)[2][vectors.shape[1] :]
+    dimensions = vectors.shape[1]
+    right = np.linalg.svd(vectors.T, full_matrices=True)[2]
+    null = right[dimensions:]
     while len(null) and np.count_nonzero(factors) > keep:
-        step = null[0] if null[0].max() > 0 else -null[0]
+        step = null[0]
+        if step.max() <= 0:
+            step = -step
         falls = (step > 0) & (factors > 0)
         lengths = np.full(len(factors), np.inf)
         lengths[falls] = factors[falls] / step[falls]
         first = int(lengths.argmin())
-        factors = np.maximum(factors - lengths[first] * step, 0.0)
+        moved = factors - lengths[first] * step
+        factors = np.maximum(moved, 0.0)
         factors[first] = 0.0
         factors[factors < TINY * factors.max()] = 0.0
         null = _without(null, first)
@@ -65,14 +78,19 @@ def _reduced(vectors: Vectors, keep: int) -> Weights:
 def _without(null: Vectors, column: int) -> Vectors:
     """Return a basis of those directions of an orthonormal one ``(L, K)`` that are 0 there."""
     mirror = null[:, column].copy()
-    mirror[0] += np.copysign(np.linalg.norm(mirror), mirror[0])
-    reflected = null - np.outer(mirror, 2 * (mirror @ null) / (mirror @ mirror))
+    length = np.linalg.norm(mirror)
+    mirror[0] += np.copysign(length, mirror[0])
+    shares = 2 * (mirror @ null) / (mirror @ mirror)
+    reflected = null - np.outer(mirror, shares)
     reflected[1:, column] = 0.0
     return reflected[1:]
 
 
 def _corrected(vectors: Vectors, weights: Weights, total: Vectors) -> Weights:
     """Remove the rounding of the sum ``(D,)`` of weighted vectors, where weights stay above 0."""
-    change = np.linalg.lstsq(vectors.T, total - weights @ vectors, rcond=None)[0]
+    missing = total - weights @ vectors
+    change = np.linalg.lstsq(vectors.T, missing, rcond=None)[0]
     corrected = weights + change
-    return corrected if (corrected > 0).all() else weights
+    if (corrected > 0).all():
+        return corrected
+    return weights

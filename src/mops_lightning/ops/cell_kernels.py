@@ -14,17 +14,22 @@ from mops_lightning.ops.jit import jit, jit_cached
 STEPS = 2.0**36
 """Steps per side of a voxel, to which the means of its points are exact."""
 
-UNSEEN, NEAR, KEPT = 0, 1, 2
+UNSEEN = 0
+NEAR = 1
+KEPT = 2
 """States of a point: no kept point is near so far, one is, or it is kept."""
 
-MIX_X, MIX_Y, MIX_Z = 0x1B873593CC9E2D51, -0x61C8864680B583EB, 0x2545F4914F6CDD1D
+MIX_X = 0x1B873593CC9E2D51
+MIX_Y = -0x61C8864680B583EB
+MIX_Z = 0x2545F4914F6CDD1D
 """Odd factors, of which the high bits of products are well mixed."""
 
 
 @jit
 def _slot(x, y, z, mask):
     """Return where the search for a place begins in a table of mask + 1 slots."""
-    return ((x * MIX_X + y * MIX_Y + z * MIX_Z) >> 32) & mask
+    mixed = x * MIX_X + y * MIX_Y + z * MIX_Z
+    return (mixed >> 32) & mask
 
 
 @jit
@@ -33,7 +38,10 @@ def _larger_table(places, table):
     larger = np.full(2 * len(table), -1, np.int32)
     mask = len(larger) - 1
     for cell in range(len(places) // 3):
-        slot = _slot(places[3 * cell], places[3 * cell + 1], places[3 * cell + 2], mask)
+        x = places[3 * cell]
+        y = places[3 * cell + 1]
+        z = places[3 * cell + 2]
+        slot = _slot(x, y, z, mask)
         while larger[slot] >= 0:
             slot = (slot + 1) & mask
         larger[slot] = cell
@@ -91,7 +99,8 @@ def group(points, size):
 def _steps_inside(value, size):
     """Return how far inside its voxel a coordinate is."""
     place = value / size
-    return np.int64((place - np.floor(place)) * STEPS)
+    inside = place - np.floor(place)
+    return np.int64(inside * STEPS)
 
 
 @jit_cached
@@ -103,7 +112,8 @@ def add_up(points, size, cell_of, known):
         cell = cell_of[i]
         counts[cell] += 1
         for axis in range(3):
-            sums[3 * cell + axis] += _steps_inside(points[3 * i + axis], size)
+            coordinate = points[3 * i + axis]
+            sums[3 * cell + axis] += _steps_inside(coordinate, size)
     return counts, sums
 
 
@@ -111,8 +121,10 @@ def add_up(points, size, cell_of, known):
 def _is_lower(points, i, j):
     """Return whether the coordinates of point i come before those of point j."""
     for axis in range(3):
-        if points[3 * i + axis] != points[3 * j + axis]:
-            return points[3 * i + axis] < points[3 * j + axis]
+        a = points[3 * i + axis]
+        b = points[3 * j + axis]
+        if a != b:
+            return a < b
     return False
 
 
@@ -135,7 +147,8 @@ def nearest(points, size, cell_of, means, weight):
             inside = _steps_inside(points[3 * i + axis], size)
             difference = inside - means[3 * cell + axis]
             squared += difference * difference
-        if squared < best[cell] or (squared == best[cell] and _is_lower(points, i, row)):
+        is_tied = squared == best[cell]
+        if squared < best[cell] or (is_tied and _is_lower(points, i, row)):
             best[cell] = squared
             rows[cell] = i
     return rows, best
@@ -145,13 +158,15 @@ def nearest(points, size, cell_of, means, weight):
 def hashes_of(bits, channels, seed):
     """Hash every point, by the finalizer of SplitMix64 once for every coordinate."""
     out = np.empty(len(bits) // channels, np.uint64)
-    first, second = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
+    first = np.uint64(0xBF58476D1CE4E5B9)
+    second = np.uint64(0x94D049BB133111EB)
     step = np.uint64(0x9E3779B97F4A7C15)
     begin = (seed + np.uint64(1)) * step
     for i in range(len(out)):
         key = begin
         for c in range(channels):
-            key = (key ^ bits[i * channels + c]) + step
+            value = bits[i * channels + c]
+            key = (key ^ value) + step
             key = (key ^ (key >> np.uint64(30))) * first
             key = (key ^ (key >> np.uint64(27))) * second
             key = key ^ (key >> np.uint64(31))
@@ -165,7 +180,8 @@ def _comes_first(i, j, hashes, points, channels):
     if hashes[i] != hashes[j]:
         return hashes[i] < hashes[j]
     for c in range(channels):
-        a, b = points[i * channels + c], points[j * channels + c]
+        a = points[i * channels + c]
+        b = points[j * channels + c]
         if a != b:
             return a < b
     return i < j
@@ -239,7 +255,9 @@ def visit(points, channels, places, starts, cell_of, cells, table, order, limit)
         if seen[place] != UNSEEN:
             continue
         at = channels * place
-        own_x, own_y, own_z = points[at], points[at + 1], points[at + 2]
+        own_x = points[at]
+        own_y = points[at + 1]
+        own_z = points[at + 2]
         home = 3 * cell_of[row]
         for neighbour in range(27):
             x = cells[home] + neighbour // 9 - 1
@@ -248,7 +266,8 @@ def visit(points, channels, places, starts, cell_of, cells, table, order, limit)
             slot = _slot(x, y, z, mask)
             cell = table[slot]
             while cell >= 0:
-                if cells[3 * cell] == x and cells[3 * cell + 1] == y and cells[3 * cell + 2] == z:
+                other = 3 * cell
+                if cells[other] == x and cells[other + 1] == y and cells[other + 2] == z:
                     break
                 slot = (slot + 1) & mask
                 cell = table[slot]

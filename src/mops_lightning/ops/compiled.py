@@ -39,15 +39,21 @@ def farthest(
     """Fill up rows of every cloud by farthest points; see ``ops.farthest.farthest_rows``."""
     if points.device.type != "cpu" or points.numel() == 0:
         return None
+    if factors is None:
+        factor_array = None
+    else:
+        factor_array = factors.numpy()
     rows = farthest_rows(
         points.detach().to(distance_dtype(points)).numpy(),
         given.numpy(),
         counts.numpy(),
         m,
-        None if factors is None else factors.numpy(),
+        factor_array,
         threads=torch.get_num_threads(),
     )
-    return None if rows is None else torch.from_numpy(rows)
+    if rows is None:
+        return None
+    return torch.from_numpy(rows)
 
 
 def farthest_from_start(
@@ -60,15 +66,21 @@ def farthest_from_start(
     """Return farthest points of every cloud; see ``ops.farthest.rows_from_start``."""
     if points.device.type != "cpu" or points.numel() == 0:
         return None
+    if weight is None:
+        weight_array = None
+    else:
+        weight_array = weight.double().numpy()
     rows = rows_from_start(
         points.detach().to(distance_dtype(points)).numpy(),
         m,
         order,
         start,
-        None if weight is None else weight.double().numpy(),
+        weight_array,
         torch.get_num_threads(),
     )
-    return None if rows is None else torch.from_numpy(rows)
+    if rows is None:
+        return None
+    return torch.from_numpy(rows)
 
 
 def nearest(queries: Tensor, points: Tensor, k: int) -> Tensor | None:
@@ -82,7 +94,7 @@ def nearest(queries: Tensor, points: Tensor, k: int) -> Tensor | None:
     Returns:
         ``(B, M, k)`` int64, nearest first, the lowest row in case of ties.
     """
-    if points.device.type != "cpu" or not (points.numel() and queries.numel()):
+    if points.device.type != "cpu":
         return None
     if k > 1:
         return _several_nearest(queries, points, k)
@@ -125,7 +137,7 @@ def winners(features: Tensor, rows: Tensor) -> Tensor | None:
     Returns:
         ``(B, M, C)`` int64, the first row in case of ties, or of a NaN.
     """
-    if features.device.type != "cpu" or features.dtype.itemsize < 4 or not features.numel():
+    if features.device.type != "cpu" or features.numel() == 0:
         return None
     largest = torch.empty(*rows.shape[:2], features.shape[2], dtype=torch.int64)
     arrays = [part.detach().contiguous().numpy() for part in (features, rows, largest)]
@@ -150,19 +162,26 @@ def _in_threads(function: Callable[[slice], Any], clouds: int, work: int) -> lis
 def _planes(points: Tensor) -> Array:
     """Return a copy ``(B, C·N)``, one channel after the other, which may be overwritten."""
     values = points.detach().to(distance_dtype(points)).numpy()
-    return np.array(values.transpose(0, 2, 1), order="C").reshape(len(values), -1)
+    planes = np.array(values.transpose(0, 2, 1), order="C")
+    return planes.reshape(len(values), -1)
 
 
 def _integer(floats: Array) -> Any:
     """Return the integers of the same width."""
-    return np.int32 if floats.dtype == np.float32 else np.int64
+    if floats.dtype == np.float32:
+        return np.int32
+    return np.int64
 
 
 def _rows(
-    function: Callable[[tuple[Array, ...]], Array], clouds: Iterable[tuple[Array, ...]], work: int
+    function: Callable[[tuple[Array, ...]], Array],
+    clouds: Iterable[tuple[Array, ...]],
+    work: int,
 ) -> Tensor | None:
     """Return the rows chosen from every cloud, computed in threads where that is faster."""
-    workers = torch.get_num_threads() if work >= THREADS_MIN_WORK else 1
+    workers = 1
+    if work >= THREADS_MIN_WORK:
+        workers = torch.get_num_threads()
     if workers == 1:
         rows = [function(cloud) for cloud in clouds]
     else:
@@ -170,4 +189,6 @@ def _rows(
             rows = list(pool.map(function, clouds))
     if not all(map(len, rows)):  # points that are not finite
         return None
-    return torch.from_numpy(rows[0][None] if len(rows) == 1 else np.stack(rows))
+    if len(rows) == 1:
+        return torch.from_numpy(rows[0][None])
+    return torch.from_numpy(np.stack(rows))

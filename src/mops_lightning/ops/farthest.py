@@ -13,7 +13,8 @@ LEAF = 1024
 """Maximum number of points of a leaf of the tree: more leaves exclude more points, larger ones
 take less time per point."""
 
-SPARSE, SPARSE_LEAF = 100, 4096
+SPARSE = 100
+SPARSE_LEAF = 4096
 """Points per chosen point from which a tree with larger leaves is faster, and their size."""
 
 THREADS_MIN_WORK = 2**22
@@ -59,8 +60,12 @@ def farthest_rows(
     chosen = np.empty((clouds, m), np.int64)
     chosen[:, : given.shape[1]] = given
     reached = np.array(counts, np.int64)
-    factors = np.empty((clouds, 0)) if factors is None else np.ascontiguousarray(factors)
-    workers = min(threads, clouds) if m * n * clouds >= THREADS_MIN_WORK else 1
+    if factors is None:
+        factors = np.empty((clouds, 0))
+    factors = np.ascontiguousarray(factors)
+    workers = 1
+    if m * n * clouds >= THREADS_MIN_WORK:
+        workers = min(threads, clouds)
     if workers == 1:
         finite = _fill(points, chosen, reached, factors, order)
     else:
@@ -75,7 +80,8 @@ def farthest_rows(
     if not finite:
         return None
     for cloud in np.flatnonzero(reached < m):
-        _fill_with_copies(chosen[cloud], int(reached[cloud]), points[cloud : cloud + 1], order)
+        points_of_cloud = points[cloud : cloud + 1]
+        _fill_with_copies(chosen[cloud], int(reached[cloud]), points_of_cloud, order)
     return chosen
 
 
@@ -114,14 +120,18 @@ def rows_from_start(
         assert weight is not None
         given = _first_of_largest(weight, points, order)
     counts = np.full(clouds, given.shape[1])
-    factors = None if weight is None else squared_factors(weight)
+    factors = None
+    if weight is not None:
+        factors = squared_factors(weight)
     return farthest_rows(points, given, counts, m, factors, order, threads)
 
 
 def squared_factors(weight: Array) -> NDArray[np.float64]:
     """Return the factors ``(B, N)`` of squared distances for weights of distances."""
-    relative = weight.astype(np.float64) / weight.max(1, keepdims=True)
-    factors: NDArray[np.float64] = np.maximum(np.square(relative), LEAST_FACTOR)
+    exact = weight.astype(np.float64)
+    relative = exact / weight.max(1, keepdims=True)
+    squared = np.square(relative)
+    factors: NDArray[np.float64] = np.maximum(squared, LEAST_FACTOR)
     return factors
 
 
@@ -131,7 +141,8 @@ def _squares_from_mean(points: Array) -> NDArray[np.float64]:
     squares = np.zeros(points.shape[:2])
     with np.errstate(over="ignore"):  # infinite squares are largest, too
         for axis in range(points.shape[2]):
-            squares += np.square(points[..., axis] - centres[..., axis])
+            apart = points[..., axis] - centres[..., axis]
+            squares += np.square(apart)
     return squares
 
 
@@ -141,19 +152,29 @@ def _first_of_largest(values: Array, points: Array, order: SeededOrder) -> Rows:
     if (is_largest.sum(1) == 1).all():
         return is_largest.argmax(1)[:, None]
     keys = seeded_keys(points, order)
-    return np.where(is_largest, keys, np.iinfo(keys.dtype).max).argmin(1)[:, None]
+    last = np.iinfo(keys.dtype).max
+    rows = np.where(is_largest, keys, last).argmin(1)
+    return rows[:, None]
 
 
 def _fill(
-    points: Array, chosen: Array, counts: Array, factors: Array, order: SeededOrder | None
+    points: Array,
+    chosen: Array,
+    counts: Array,
+    factors: Array,
+    order: SeededOrder | None,
 ) -> bool:
     """Call the compiled loops, which write to ``chosen`` and ``counts``."""
     _, n, channels = points.shape
-    leaf = SPARSE_LEAF if n > SPARSE * chosen.shape[1] else LEAF
-    ranking, word = kernel_farthest.BY_ROW, seed_word(0)
+    leaf = LEAF
+    if n > SPARSE * chosen.shape[1]:
+        leaf = SPARSE_LEAF
+    ranking = kernel_farthest.BY_ROW
+    word = seed_word(0)
     if order is not None:
-        in_sphere, by_keys = kernel_farthest.BY_KEYS_IN_SPHERE, kernel_farthest.BY_KEYS
-        ranking = in_sphere if order.in_sphere else by_keys
+        ranking = kernel_farthest.BY_KEYS
+        if order.in_sphere:
+            ranking = kernel_farthest.BY_KEYS_IN_SPHERE
         word = seed_word(order.seed)
     finite: bool = kernel_farthest.farthest(
         points.reshape(-1),
@@ -183,7 +204,8 @@ def _fill_with_copies(chosen: Array, reached: int, cloud: Array, order: SeededOr
     if order is not None:
         keys = seeded_keys(cloud, order)[0]
         copies = copies[np.argsort(keys[copies], kind="stable")]
-    chosen[reached:] = copies[: len(chosen) - reached]
+    number = len(chosen) - reached
+    chosen[reached:] = copies[:number]
 
 
 def float_points(points: Array) -> Array:
@@ -191,4 +213,6 @@ def float_points(points: Array) -> Array:
     native = points.astype(points.dtype.newbyteorder("="), copy=False)
     if native.dtype in (np.float32, np.float64):
         return native
-    return native.astype(np.float32 if native.dtype == np.float16 else np.float64)
+    if native.dtype == np.float16:
+        return native.astype(np.float32)
+    return native.astype(np.float64)

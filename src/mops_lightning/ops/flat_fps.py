@@ -132,12 +132,15 @@ def _sizes(counts: Rows, ratio: Any) -> Rows:
     are_shares = ((shares > 0) & (shares <= 1)).all()
     if not are_shares or len(shares) not in (1, len(counts)):
         raise UserError(f"ratio must be above 0 and at most 1, one or one per cloud, got {ratio}.")
-    return np.ceil(counts.astype(np.float32) * shares).astype(np.int64)
+    exact = counts.astype(np.float32) * shares
+    return np.ceil(exact).astype(np.int64)
 
 
 def _are_alike(counts: Rows, sizes: Rows) -> bool:
     """Return whether all clouds have one number of points, of which one number is chosen."""
-    return bool((counts == counts[0]).all() and (sizes == sizes[0]).all())
+    have_same_counts = (counts == counts[0]).all()
+    have_same_sizes = (sizes == sizes[0]).all()
+    return bool(have_same_counts and have_same_sizes)
 
 
 def _random_starts(counts: Rows, is_array: bool) -> Rows:
@@ -159,7 +162,8 @@ def _chosen(points: Array, counts: Rows, sizes: Rows, starts: Rows) -> Rows:
         rows = _of_clouds(clouds, int(sizes[0]), starts)
         return (rows + begins[:, None]).reshape(-1)
     rows_of_clouds = []
-    for begin, count, m, start in zip(begins, counts, sizes, starts, strict=True):
+    numbers = zip(begins, counts, sizes, starts, strict=True)
+    for begin, count, m, start in numbers:
         if count == 0:
             continue
         cloud = points[begin : begin + count]
@@ -170,7 +174,8 @@ def _chosen(points: Array, counts: Rows, sizes: Rows, starts: Rows) -> Rows:
 
 def _of_clouds(clouds: Array, m: int, starts: Rows) -> Rows:
     """Choose m points of every cloud of one size."""
-    rows = farthest_rows(clouds, starts[:, None], np.ones_like(starts), m)
+    one_each = np.ones_like(starts)
+    rows = farthest_rows(clouds, starts[:, None], one_each, m)
     if rows is None:
         raise UserError("x must be finite, got NaN or infinity.")
     return rows
@@ -184,14 +189,18 @@ def _on_device(x: "Tensor", counts: Rows, sizes: Rows, starts: Rows) -> "Tensor"
 
     if not bool(x.isfinite().all()):
         raise UserError("x must be finite, got NaN or infinity.")
-    floating = x.detach() if x.is_floating_point() else x.double()
+    if x.is_floating_point():
+        floating = x.detach()
+    else:
+        floating = x.double()
     points = floating.reshape(len(x), -1)
     begins = counts.cumsum() - counts
     if _are_alike(counts, sizes):
         clouds = points.reshape(len(counts), int(counts[0]), -1)
         first = torch.from_numpy(starts).to(x.device)
         rows = farthest_point_sample(clouds, int(sizes[0]), first)
-        return (rows + torch.from_numpy(begins)[:, None].to(x.device)).flatten()
+        begins_on_device = torch.from_numpy(begins).to(x.device)
+        return (rows + begins_on_device[:, None]).flatten()
     clouds_of_points = points.split(counts.tolist())
     numbers = zip(sizes.tolist(), starts.tolist(), begins.tolist(), strict=True)
     rows_of_clouds = []

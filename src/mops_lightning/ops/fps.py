@@ -12,7 +12,10 @@ from mops_lightning.ops.points import gather_points, to_planes
 
 
 def farthest_point_sample(
-    points: Tensor, m: int, start: int | Tensor = 0, weight: Tensor | None = None
+    points: Tensor,
+    m: int,
+    start: int | Tensor = 0,
+    weight: Tensor | None = None,
 ) -> Tensor:
     """Choose m points, each as far as possible from the points chosen before it.
 
@@ -47,14 +50,20 @@ def farthest_point_sample(
     if not 1 <= m <= n:
         raise UserError(f"m must be between 1 and the number of points N={n}, got {m}.")
     outside = (start < 0) | (start >= n)
-    if outside if isinstance(outside, bool) else bool(outside.any()):
+    if isinstance(outside, Tensor):
+        outside = bool(outside.any())
+    if outside:
         raise UserError(f"start must be between 0 and N-1={n - 1}, got {start}.")
     first = torch.as_tensor(start, device=points.device).expand(clouds)
-    return farthest(points, first[:, None], torch.ones_like(first), m, weight)
+    one_each = torch.ones_like(first)
+    return farthest(points, first[:, None], one_each, m, weight)
 
 
 def farthest_point_fill(
-    points: Tensor, indices: Tensor, counts: Tensor, weight: Tensor | None = None
+    points: Tensor,
+    indices: Tensor,
+    counts: Tensor,
+    weight: Tensor | None = None,
 ) -> Tensor:
     """Fill up subsets of every cloud by farthest point sampling.
 
@@ -100,16 +109,21 @@ def farthest(
     """
     factors = None
     if weight is not None:
-        relative = weight.double() / weight.double().amax(1, keepdim=True)
+        exact = weight.double()
+        relative = exact / exact.amax(1, keepdim=True)
         factors = relative.square().clamp_min(LEAST_FACTOR)
     if ranks is not None:  # in the order of the ranks, the lowest row wins a tie
         order = ranks.argsort(dim=1, stable=True)
         ordered = gather_points(points, order)
-        factors = None if factors is None else factors.gather(1, order)
+        if factors is not None:
+            factors = factors.gather(1, order)
         given = order.argsort(1).gather(1, given)
-        return order.gather(1, _on_device(ordered, given, counts, m, factors))
+        places = _on_device(ordered, given, counts, m, factors)
+        return order.gather(1, places)
     rows = compiled.farthest(points, given, counts, m, factors)
-    return _on_device(points, given, counts, m, factors) if rows is None else rows
+    if rows is None:
+        return _on_device(points, given, counts, m, factors)
+    return rows
 
 
 def _on_device(
@@ -124,34 +138,47 @@ def _on_device(
                 rows = triton_fps.farthest(points, given, counts, m)
                 if rows is not None:
                     return rows
-        host = None if factors is None else factors.cpu()
-        rows = compiled.farthest(points.detach().cpu(), given.cpu(), counts.cpu(), m, host)
+        host_factors = None
+        if factors is not None:
+            host_factors = factors.cpu()
+        host_points = points.detach().cpu()
+        rows = compiled.farthest(host_points, given.cpu(), counts.cpu(), m, host_factors)
         if rows is not None:
             return rows.to(points.device)
     return farthest_in_steps(points, given, counts, m, factors)
 
 
 def farthest_in_steps(
-    points: Tensor, given: Tensor, counts: Tensor, m: int, factors: Tensor | None = None
+    points: Tensor,
+    given: Tensor,
+    counts: Tensor,
+    m: int,
+    factors: Tensor | None = None,
 ) -> Tensor:
     """Choose farthest points in torch; arguments as for ``farthest``."""
     slot = torch.arange(given.shape[1], device=points.device)
-    known = torch.where(slot < counts[:, None], given, given[:, :1])
+    is_given = slot < counts[:, None]
+    known = torch.where(is_given, given, given[:, :1])
     planes = to_planes(points.detach().double())
     distances = torch.full_like(planes[0], torch.inf)
     for column in range(known.shape[1]):
         _lower(distances, planes, known[:, column : column + 1])
     added = []
     for _ in range(m - int(counts.min())):
-        gains = distances if factors is None else distances * factors
-        added.append(gains.argmax(1, keepdim=True))
-        _lower(distances, planes, added[-1])
+        gains = distances
+        if factors is not None:
+            gains = distances * factors
+        row = gains.argmax(1, keepdim=True)
+        added.append(row)
+        _lower(distances, planes, row)
     if not added:
         return known
     # Clouds that lack fewer points write the surplus beyond column m, which is then cut off.
-    filled = torch.cat([known, *added], 1)
-    places = counts[:, None] + torch.arange(len(added), device=points.device)
-    return filled.scatter_(1, places, torch.cat(added, 1))[:, :m]
+    added_rows = torch.cat(added, 1)
+    filled = torch.cat([known, added_rows], 1)
+    columns = torch.arange(len(added), device=points.device)
+    places = counts[:, None] + columns
+    return filled.scatter_(1, places, added_rows)[:, :m]
 
 
 def _lower(distances: Tensor, planes: Tensor, rows: Tensor) -> None:

@@ -44,7 +44,8 @@ def _shared_top(crowding, shares):
     """Return the largest crowding multiplied by the share."""
     top = np.int64(GONE)
     for i in range(len(crowding)):
-        top = max(top, np.int64(crowding[i] * shares[i]))
+        shared = np.int64(crowding[i] * shares[i])
+        top = max(top, shared)
     return top
 
 
@@ -53,15 +54,17 @@ def _boxes(planes, total, number, size):
     """Return the lowest and the highest coordinates ``(6·K,)`` of every block."""
     boxes = np.empty(6 * (total // size))
     for block in range(total // size):
-        start, stop = block * size, min((block + 1) * size, number)
+        start = block * size
+        stop = min(start + size, number)
         for axis in range(3):
             line = planes[axis * total + start : axis * total + stop]
             low = high = line[0]
             for i in range(len(line)):
                 low = min(low, line[i])
                 high = max(high, line[i])
-            boxes[6 * block + 2 * axis] = low
-            boxes[6 * block + 2 * axis + 1] = high
+            first = 6 * block + 2 * axis
+            boxes[first] = low
+            boxes[first + 1] = high
     return boxes
 
 
@@ -72,11 +75,16 @@ def _group_boxes(boxes):
     groups = (blocks + GROUP - 1) // GROUP
     around = np.empty(6 * groups)
     for group in range(groups):
+        first = GROUP * group
+        stop = min(first + GROUP, blocks)
         for side in range(6):
-            edge = boxes[6 * GROUP * group + side]
-            for block in range(GROUP * group, min(GROUP * (group + 1), blocks)):
+            edge = boxes[6 * first + side]
+            for block in range(first, stop):
                 other = boxes[6 * block + side]
-                edge = max(edge, other) if side % 2 else min(edge, other)
+                if side % 2:
+                    edge = max(edge, other)
+                else:
+                    edge = min(edge, other)
             around[6 * group + side] = edge
     return around
 
@@ -86,8 +94,10 @@ def _are_near(boxes, one, others, other, limit):
     """Return whether two boxes are nearer than the root of the limit."""
     total = 0.0
     for axis in range(3):
-        low, high = boxes[6 * one + 2 * axis], boxes[6 * one + 2 * axis + 1]
-        other_low, other_high = others[6 * other + 2 * axis], others[6 * other + 2 * axis + 1]
+        low = boxes[6 * one + 2 * axis]
+        high = boxes[6 * one + 2 * axis + 1]
+        other_low = others[6 * other + 2 * axis]
+        other_high = others[6 * other + 2 * axis + 1]
         gap = max(max(low - other_high, other_low - high), 0.0)
         total += gap * gap
     return total <= limit
@@ -114,7 +124,8 @@ def _near_blocks(boxes, limit):
     most = max(LISTED, GROUP) * blocks
     around = _group_boxes(boxes)
     near_groups = np.empty(len(around) // 6, np.int64)
-    starts, near = np.zeros(blocks + 1, np.int64), np.empty(most + GROUP, np.int32)
+    starts = np.zeros(blocks + 1, np.int64)
+    near = np.empty(most + GROUP, np.int32)
     known = 0
     for block in range(blocks):
         if block % GROUP == 0:
@@ -141,16 +152,20 @@ def _crowdings(planes, axes, number, size, boxes, starts, near, limit, inverse, 
     total = len(planes) // axes
     crowding = np.zeros(total, np.int64)
     for block in range(total // size):
-        start, stop = block * size, (block + 1) * size
+        start = block * size
+        stop = start + size
         for place in range(start, min(stop, number)):
             add_weights(planes, total, axes, crowding, start, stop, place, inverse, scale)
         for k in range(starts[block], starts[block + 1]):
             other = near[k]
             if other <= block:
                 continue
-            start, stop = other * size, (other + 1) * size
+            start = other * size
+            stop = start + size
             for place in range(block * size, (block + 1) * size):
-                x, y, z = planes[place], planes[total + place], planes[2 * total + place]
+                x = planes[place]
+                y = planes[total + place]
+                z = planes[2 * total + place]
                 if _is_near(x, y, z, boxes, other, limit):
                     crowding[place] += add_weights(
                         planes, total, axes, crowding, start, stop, place, inverse, scale
@@ -177,9 +192,12 @@ def _lowest_row(start, stop, rows, crowding, shares, top, lowest):
     """Return the place of the lowest row with the largest crowding, if it is below ``lowest``."""
     found = -1
     for place in range(start, stop):
-        value = np.int64(crowding[place] * shares[place]) if len(shares) else crowding[place]
+        value = crowding[place]
+        if len(shares):
+            value = np.int64(crowding[place] * shares[place])
         if value == top and rows[place] < lowest:
-            found, lowest = place, rows[place]
+            found = place
+            lowest = rows[place]
     return found, lowest
 
 
@@ -191,11 +209,13 @@ def _most_crowded(tops, group_tops, size, rows, crowding, shares):
         place = _only_most_crowded(tops, group_tops, size, crowding, top)
         if place >= 0:
             return place
-    lowest, best = np.int64(2**62), 0
+    lowest = np.int64(2**62)
+    best = 0
     for group in range(len(group_tops)):
         if group_tops[group] != top:
             continue
-        for block in range(GROUP * group, min(GROUP * (group + 1), len(tops))):
+        first = GROUP * group
+        for block in range(first, min(first + GROUP, len(tops))):
             if tops[block] == top:
                 start = block * size
                 found, lowest = _lowest_row(
@@ -228,32 +248,41 @@ def _remove(
     total = len(crowding)
     tops = np.empty(total // size, np.int64)
     for block in range(len(tops)):
-        start, stop = block * size, (block + 1) * size
+        start = block * size
+        stop = start + size
         if len(shares):
             tops[block] = _shared_top(crowding[start:stop], shares[start:stop])
         else:
             tops[block] = _top(crowding[start:stop])
-    group_tops = np.empty((len(tops) + GROUP - 1) // GROUP, np.int64)
-    for group in range(len(group_tops)):
-        group_tops[group] = _top(tops[GROUP * group : GROUP * (group + 1)])
+    groups = (len(tops) + GROUP - 1) // GROUP
+    group_tops = np.empty(groups, np.int64)
+    for group in range(groups):
+        tops_of_group = tops[GROUP * group : GROUP * (group + 1)]
+        group_tops[group] = _top(tops_of_group)
     for _ in range(count):
         place = _most_crowded(tops, group_tops, size, rows, crowding, shares)
-        x, y, z = planes[place], planes[total + place], planes[2 * total + place]
+        x = planes[place]
+        y = planes[total + place]
+        z = planes[2 * total + place]
         crowding[place] = GONE
         if len(shares):
             shares[place] = 1.0
-        for k in range(starts[place // size], starts[place // size + 1]):
+        home = place // size
+        for k in range(starts[home], starts[home + 1]):
             block = near[k]
             if not _is_near(x, y, z, boxes, block, limit):
                 continue
-            start, stop = block * size, (block + 1) * size
+            start = block * size
+            stop = start + size
             top = take_weights(planes, total, axes, crowding, start, stop, place, inverse, scale)
             if len(shares):
                 top = _shared_top(crowding[start:stop], shares[start:stop])
-            before, group = tops[block], block // GROUP
+            before = tops[block]
+            group = block // GROUP
             tops[block] = top
             if before == group_tops[group] and top != before:
-                group_tops[group] = _top(tops[GROUP * group : GROUP * (group + 1)])
+                tops_of_group = tops[GROUP * group : GROUP * (group + 1)]
+                group_tops[group] = _top(tops_of_group)
 
 
 @jit
@@ -261,15 +290,18 @@ def _blocks_of(planes, axes, rows, crowding, shares, number, size):
     """Copy the points that remain to blocks; the rest of the last block is gone, and far away."""
     total = (number + size - 1) // size * size
     new_planes = np.full(axes * total, np.inf)
-    new_rows, new_crowding = np.full(total, 2**62), np.full(total, GONE)
+    new_rows = np.full(total, 2**62)
+    new_crowding = np.full(total, GONE)
     new_shares = np.ones(total if len(shares) else 0)
-    before, place = len(rows), 0
+    before = len(rows)
+    place = 0
     for i in range(before):
         if crowding[i] < 0:
             continue
         for axis in range(axes):
             new_planes[axis * total + place] = planes[axis * before + i]
-        new_rows[place], new_crowding[place] = rows[i], crowding[i]
+        new_rows[place] = rows[i]
+        new_crowding[place] = crowding[i]
         if len(shares):
             new_shares[place] = shares[i]
         place += 1
@@ -293,7 +325,8 @@ def eliminate(planes, axes, rows, shares, m, limit, inverse, scale):
     Returns:
         ``(m,)`` rows that remain, in the order of the curve.
     """
-    number, size = len(rows), BLOCK
+    number = len(rows)
+    size = BLOCK
     crowding = np.zeros(number, np.int64)
     known = False
     while number > m:
@@ -310,7 +343,8 @@ def eliminate(planes, axes, rows, shares, m, limit, inverse, scale):
                 planes, axes, number, size, boxes, starts, near, limit, inverse, scale
             )
             known = True
-        count = min(number - m, max(int(number * (1 - KEPT_SHARE)), 1))
+        share = int(number * (1 - KEPT_SHARE))
+        count = min(number - m, max(share, 1))
         _remove(
             planes,
             axes,

@@ -25,7 +25,9 @@ from mops_lightning.ops.kernels import (
 BLOCK = 128
 """Number of distances that are compared at a time."""
 
-BY_ROW, BY_KEYS, BY_KEYS_IN_SPHERE = 0, 1, 2
+BY_ROW = 0
+BY_KEYS = 1
+BY_KEYS_IN_SPHERE = 2
 """What comes first and wins a tie: the lowest row, or the lowest key of the given points or of
 those in the unit sphere."""
 
@@ -53,9 +55,12 @@ def farthest(points, chosen, counts, factors, ranking, word, channels, leaf):
         Whether all coordinates are finite.
     """
     clouds = len(counts)
-    size, steps = len(points) // (clouds * channels), len(chosen) // clouds
+    size = len(points) // (clouds * channels)
+    steps = len(chosen) // clouds
+    in_sphere = ranking == BY_KEYS_IN_SPHERE
     for cloud in range(clouds):
-        start, stop = cloud * size, (cloud + 1) * size
+        start = cloud * size
+        stop = start + size
         given = points[start * channels : stop * channels]
         planes, largest = to_planes(given, channels)
         if not largest < np.inf:
@@ -63,10 +68,12 @@ def farthest(points, chosen, counts, factors, ranking, word, channels, leaf):
         ranks = np.empty(0, np.int64)
         rows = chosen[cloud * steps : (cloud + 1) * steps]
         if counts[cloud] == 0:
-            ranks = ranks_of(planes, channels, largest, word, ranking == BY_KEYS_IN_SPHERE, True)
+            ranks = ranks_of(planes, channels, largest, word, in_sphere, True)
             rows[0] = _first_of_lowest(ranks)
             counts[cloud] = 1
-        weights = factors[start:stop] if len(factors) else factors
+        weights = factors
+        if len(factors):
+            weights = factors[start:stop]
         counts[cloud] = _choose(
             given, planes, rows, counts[cloud], weights, ranking, word, ranks, channels, leaf
         )
@@ -93,40 +100,62 @@ def _choose(points, planes, chosen, given, factors, ranking, word, ranks, channe
 
     Keys are computed at the first tie, unless the first point needed them: ``ranks`` is ``(0,)``.
     """
-    size, steps = len(planes) // channels, len(chosen)
+    size = len(planes) // channels
+    steps = len(chosen)
     rows, nodes, boxes = build_tree(planes, channels, leaf)
     known = len(nodes) // 4
     factors = _sorted(factors, rows)
     # The bits of floats ≥ 0, read as integers, have the same order, and numba vectorises the
     # maximum of integers only. Chosen points have the distance -1, a negative integer.
-    bits = np.full(size, float_bits(planes.dtype.type(np.inf)))
+    infinity = planes.dtype.type(np.inf)
+    bits = np.full(size, float_bits(infinity))
     gaps = bits.view(planes.dtype)
     # The largest distance of every node and, with factors, the largest product.
     tops = np.full(known, bits[0])
-    gains = np.full(known if len(factors) else 0, np.inf)
+    gain_nodes = 0
+    if len(factors):
+        gain_nodes = known
+    gains = np.full(gain_nodes, np.inf)
     # Float64 coordinates of the chosen points; float64 distances, and to how many of them.
     path = np.empty(channels * steps)
-    exact, seen = np.empty(size), np.zeros(size, np.int32)
-    found, stack = np.empty(size, np.uint32), np.empty(known + FANOUT, np.int64)
-    new, point = np.empty(min(leaf, size), planes.dtype), np.empty(channels, planes.dtype)
-    places = _inverse(rows) if given > 1 else rows
+    exact = np.empty(size)
+    seen = np.zeros(size, np.int32)
+    found = np.empty(size, np.uint32)
+    stack = np.empty(known + FANOUT, np.int64)
+    new = np.empty(min(leaf, size), planes.dtype)
+    point = np.empty(channels, planes.dtype)
+    places = rows
+    if given > 1:
+        places = _inverse(rows)
     for step in range(steps):
         place = np.int64(0)
         if step < given:
-            place = np.int64(places[chosen[step]]) if given > 1 else place_of(rows, chosen[step])
+            if given > 1:
+                place = np.int64(places[chosen[step]])
+            else:
+                place = place_of(rows, chosen[step])
         else:
             count = _candidates(nodes, tops, bits, gains, factors, gaps, channels, stack, found)
-            place, best = np.int64(found[0]), -1.0
-            for k in range(count if count > 1 else 0):
+            place = np.int64(found[0])
+            best = -1.0
+            if count == 1:
+                count = 0
+            for k in range(count):
                 i = found[k]
                 low = _least_square(path, seen[i], step, steps, planes, i)
-                exact[i] = min(exact[i], low) if seen[i] else low
+                if seen[i]:
+                    low = min(exact[i], low)
+                exact[i] = low
                 seen[i] = step
-                gain = exact[i] * factors[i] if len(factors) else exact[i]
+                gain = low
+                if len(factors):
+                    gain = low * factors[i]
                 if gain == best and ranking != BY_ROW and len(ranks) == 0:
                     ranks = _ranks_of_given(points, channels, word, ranking == BY_KEYS_IN_SPHERE)
-                if gain > best or (gain == best and _precedes(rows, ranks, i, place)):
-                    best, place = gain, np.int64(i)
+                is_tied = gain == best
+                if gain > best or (is_tied and _precedes(rows, ranks, i, place)):
+                    best = gain
+                    place = np.int64(i)
             if best == 0:
                 return step
             chosen[step] = rows[place]
@@ -159,7 +188,8 @@ def _inverse(rows):
 @jit
 def _precedes(rows, ranks, place, other):
     """Return whether a point is chosen before another one at the same distance."""
-    row, other_row = rows[place], rows[other]
+    row = rows[place]
+    other_row = rows[other]
     if len(ranks) and ranks[row] != ranks[other_row]:
         return ranks[row] < ranks[other_row]
     return row < other_row
@@ -168,7 +198,8 @@ def _precedes(rows, ranks, place, other):
 @jit
 def _least_square(path, start, stop, steps, planes, place):
     """Return a point's least squared distance to chosen points, computed in float64."""
-    size, channels = len(planes) * steps // len(path), len(path) // steps
+    size = len(planes) * steps // len(path)
+    channels = len(path) // steps
     bits = np.full(stop - start, float_bits(0.0))
     squares = bits.view(path.dtype)
     for axis in range(channels):
@@ -188,33 +219,47 @@ def _candidates(nodes, tops, bits, gains, factors, gaps, channels, stack, found)
     """Find the places of all points that could be the farthest; return their number."""
     limits = np.finfo(gaps.dtype)
     share = 1 - 2 * (channels + 2) * np.float64(limits.eps)  # twice the largest rounding error
-    top = gains[0] if len(gains) else np.float64(bits_float(tops[0], gaps[0]))
-    least = max(min(top, np.float64(limits.max)) * share - channels * limits.tiny, 0.0)
+    top = np.float64(bits_float(tops[0], gaps[0]))
+    if len(gains):
+        top = gains[0]
+    top = min(top, np.float64(limits.max))
+    least = max(top * share - channels * limits.tiny, 0.0)
     wanted = float_bits(gaps.dtype.type(least))
-    stack[0], depth, count = 0, 1, 0
+    stack[0] = 0
+    depth = 1
+    count = 0
     while depth:
         depth -= 1
         node = stack[depth]
-        if gains[node] < least if len(gains) else tops[node] < wanted:
+        is_below = tops[node] < wanted
+        if len(gains):
+            is_below = gains[node] < least
+        if is_below:
             continue
         first = nodes[4 * node + 2]
-        for k in range(first, first + nodes[4 * node + 3]):
+        children = nodes[4 * node + 3]
+        for k in range(first, first + children):
             stack[depth] = k
             depth += 1
-        if nodes[4 * node + 3]:
+        if children:
             continue
-        start, stop = nodes[4 * node], nodes[4 * node + 1]
+        start = nodes[4 * node]
+        stop = nodes[4 * node + 1]
         if len(gains):
             for i in range(start, stop):
-                if gaps[i] >= 0 and gaps[i] * factors[i] >= least:
+                is_free = gaps[i] >= 0
+                if is_free and gaps[i] * factors[i] >= least:
                     found[count] = i
                     count += 1
             continue
         for begin in range(start, stop, BLOCK):
-            part, low = bits[begin : min(begin + BLOCK, stop)], bits[begin]
+            part = bits[begin : min(begin + BLOCK, stop)]
+            low = bits[begin]
             for i in range(len(part)):
                 low = part[i] if part[i] > low else low
-            for i in range(len(part) if low >= wanted else 0):
+            if low < wanted:
+                continue
+            for i in range(len(part)):
                 if part[i] >= wanted:
                     found[count] = begin + i
                     count += 1
@@ -225,13 +270,17 @@ def _candidates(nodes, tops, bits, gains, factors, gaps, channels, stack, found)
 def _update(planes, nodes, boxes, place, point, bits, tops, gains, factors, gaps, stack, new):
     """Lower the distances of all points to those from a chosen point."""
     size = len(bits)
-    stack[0], depth = 0, 1
+    stack[0] = 0
+    depth = 1
     while depth:
         depth -= 1
         node = stack[depth]
         above = node < 0  # all children are up to date
-        node = ~node if above else node
-        first, stop = nodes[4 * node + 2], nodes[4 * node + 2] + nodes[4 * node + 3]
+        if above:
+            node = ~node
+        children = nodes[4 * node + 3]
+        first = nodes[4 * node + 2]
+        stop = first + children
         if above:
             tops[node] = tops[first]
             for k in range(first + 1, stop):
@@ -240,21 +289,24 @@ def _update(planes, nodes, boxes, place, point, bits, tops, gains, factors, gaps
                 gains[node] = gains[first]
                 for k in range(first + 1, stop):
                     gains[node] = max(gains[node], gains[k])
-        elif nodes[4 * node + 3]:
+        elif children:
             stack[depth] = ~node
             depth += 1
             for k in range(first, stop):
-                near = float_bits(distance_to_box(boxes, k, point)) < tops[k]
-                if near or nodes[4 * k] <= place < nodes[4 * k + 1]:
+                nearest = float_bits(distance_to_box(boxes, k, point))
+                if nearest < tops[k] or nodes[4 * k] <= place < nodes[4 * k + 1]:
                     stack[depth] = k
                     depth += 1
         else:
-            start, stop = nodes[4 * node], nodes[4 * node + 1]
-            tops[node] = _lower(planes, size, start, stop, point, bits[start:stop], new)
+            start = nodes[4 * node]
+            stop = nodes[4 * node + 1]
+            distances = bits[start:stop]
+            tops[node] = _lower(planes, size, start, stop, point, distances, new)
             if len(gains):
                 gains[node] = -1
                 for i in range(start, stop):
-                    gains[node] = max(gains[node], gaps[i] * factors[i])
+                    gain = gaps[i] * factors[i]
+                    gains[node] = max(gains[node], gain)
 
 
 @jit
@@ -262,19 +314,25 @@ def _lower(planes, size, start, stop, point, bits, new):
     """Lower distances to those from a point and return the largest."""
     top = float_bits(point.dtype.type(-1))
     if len(point) == 3:
-        px, py, pz = point[0], point[1], point[2]
+        px = point[0]
+        py = point[1]
+        pz = point[2]
         x = planes[start:stop]
         y = planes[size + start : size + stop]
         z = planes[2 * size + start : 2 * size + stop]
         for i in range(len(bits)):
-            dx, dy, dz = x[i] - px, y[i] - py, z[i] - pz
-            low = float_bits(multiply_add(dz, dz, multiply_add(dy, dy, dx * dx)))
+            dx = x[i] - px
+            dy = y[i] - py
+            dz = z[i] - pz
+            in_plane = multiply_add(dy, dy, dx * dx)
+            low = float_bits(multiply_add(dz, dz, in_plane))
             low = low if low < bits[i] else bits[i]
             bits[i] = low
             top = top if top > low else low
         return top
     write_distances(planes, size, start, stop, point, new)
     for i in range(len(bits)):
-        bits[i] = min(bits[i], float_bits(new[i]))
+        low = float_bits(new[i])
+        bits[i] = min(bits[i], low)
         top = max(top, bits[i])
     return top

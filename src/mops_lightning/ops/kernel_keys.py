@@ -13,7 +13,8 @@ import numpy as np
 
 from mops_lightning.ops.jit import bits_float, float_bits, jit, jit_cached
 
-FIRST, SECOND = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
+FIRST = np.uint64(0xBF58476D1CE4E5B9)
+SECOND = np.uint64(0x94D049BB133111EB)
 """The multipliers of SplitMix64."""
 
 STEP = np.uint64(0x9E3779B97F4A7C15)
@@ -44,7 +45,9 @@ def to_planes(points, channels):
     planes = np.empty(len(points), points.dtype)
     top = float_bits(points.dtype.type(0))
     if channels == 3:  # a constant stride is vectorised
-        x, y, z = planes[:size], planes[size : 2 * size], planes[2 * size :]
+        x = planes[:size]
+        y = planes[size : 2 * size]
+        z = planes[2 * size :]
         for i in range(size):
             x[i] = points[3 * i]
             y[i] = points[3 * i + 1]
@@ -65,22 +68,29 @@ def measure_sphere(planes, channels, largest, sphere):
     The mean is that of integers, whose sum does not depend on the order of the points.
     """
     size = len(planes) // channels
-    unit = math.ldexp(1.0, min(SUM_BITS - math.frexp(largest)[1], 1000))
+    exponent = SUM_BITS - math.frexp(largest)[1]
+    unit = math.ldexp(1.0, min(exponent, 1000))
+    shift_bits = float_bits(SHIFT)
     for axis in range(channels):
         line = planes[axis * size : (axis + 1) * size]
         high = low = np.int64(0)
         for begin in range(0, size, BLOCK):
-            part, total = line[begin : begin + BLOCK], np.int64(0)
+            part = line[begin : begin + BLOCK]
+            total = np.int64(0)
             for i in range(len(part)):
-                total += float_bits(np.float64(part[i]) * unit + SHIFT) - float_bits(SHIFT)
+                steps = np.float64(part[i]) * unit
+                total += float_bits(steps + SHIFT) - shift_bits
             high += total >> 32
             low += total & np.int64(0xFFFFFFFF)
-        sphere[axis] = (np.float64(high) * 2.0**32 + np.float64(low)) / size / unit
-    squares, largest_bits = np.empty(BLOCK), float_bits(0.0)
+        sum_of_steps = np.float64(high) * 2.0**32 + np.float64(low)
+        sphere[axis] = sum_of_steps / size / unit
+    squares = np.empty(BLOCK)
+    largest_bits = float_bits(0.0)
     for begin in range(0, size, BLOCK):
         part = squares[: min(BLOCK, size - begin)]
         for axis in range(channels):
-            line, centre = planes[axis * size + begin : axis * size + begin + BLOCK], sphere[axis]
+            line = planes[axis * size + begin : axis * size + begin + BLOCK]
+            centre = sphere[axis]
             if axis == 0:
                 for i in range(len(part)):
                     offset = line[i] - centre
@@ -111,7 +121,8 @@ def _scramble(word):
 @jit
 def _with_value(key, value):
     """Return a key that depends on one more coordinate."""
-    return _xor_shift((key ^ np.uint64(float_bits(value + 0.0))) * FIRST, 32)  # -0 becomes 0
+    value_bits = np.uint64(float_bits(value + 0.0))  # -0 becomes 0
+    return _xor_shift((key ^ value_bits) * FIRST, 32)
 
 
 @jit
@@ -135,13 +146,15 @@ def write_keys(planes, channels, word, sphere, keys):
         for axis in range(channels):
             line = planes[axis * size + begin : axis * size + begin + BLOCK]
             if len(sphere):
-                centre, radius = sphere[axis], sphere[channels]
+                centre = sphere[axis]
+                radius = sphere[channels]
                 for i in range(len(part)):
-                    value = np.float64(np.float32((line[i] - centre) / radius))
-                    part[i] = _with_value(part[i], value)
+                    scaled = np.float32((line[i] - centre) / radius)
+                    part[i] = _with_value(part[i], np.float64(scaled))
             else:
                 for i in range(len(part)):
-                    part[i] = _with_value(part[i], np.float64(line[i]))
+                    value = np.float64(line[i])
+                    part[i] = _with_value(part[i], value)
         for i in range(len(part)):
             total += _xor_shift(part[i], 29) * SECOND
     for i in range(size):
@@ -151,7 +164,9 @@ def write_keys(planes, channels, word, sphere, keys):
 @jit
 def _bits_of(key):
     """Return two bits of a word."""
-    return ONE << (key & np.uint64(63)) | ONE << (key >> np.uint64(6) & np.uint64(63))
+    low_bits = key & np.uint64(63)
+    next_bits = key >> np.uint64(6) & np.uint64(63)
+    return ONE << low_bits | ONE << next_bits
 
 
 @jit
@@ -171,9 +186,12 @@ def _change_copies(keys):
     """
     seen = _filter(len(keys))
     mask = np.uint64(len(seen) - 1)
-    later, count = np.empty(len(keys), np.int64), 0
+    later = np.empty(len(keys), np.int64)
+    count = 0
     for row in range(len(keys)):
-        at, bits = np.int64(keys[row] >> np.uint64(40) & mask), _bits_of(keys[row])
+        key = keys[row]
+        at = np.int64(key >> np.uint64(40) & mask)
+        bits = _bits_of(key)
         word = seen[at]
         seen[at] = word | bits
         if word & bits == bits:
@@ -185,11 +203,14 @@ def _change_copies(keys):
     mask = np.uint64(len(wanted) - 1)
     for k in range(count):
         key = keys[later[k]]
-        wanted[np.int64(key >> np.uint64(40) & mask)] |= _bits_of(key)
+        at = np.int64(key >> np.uint64(40) & mask)
+        wanted[at] |= _bits_of(key)
     count = 0
     for row in range(len(keys)):
-        bits = _bits_of(keys[row])
-        if wanted[np.int64(keys[row] >> np.uint64(40) & mask)] & bits == bits:
+        key = keys[row]
+        at = np.int64(key >> np.uint64(40) & mask)
+        bits = _bits_of(key)
+        if wanted[at] & bits == bits:
             later[count] = row
             count += 1
     _change_copies_among(keys, later, count)
@@ -202,14 +223,16 @@ def _change_copies_among(keys, rows, count):
     while slots < 2 * count:
         slots *= 2
     mask = np.uint64(slots - 1)
-    first, copies = np.empty(slots, np.uint64), np.zeros(slots, np.int64)
+    first = np.empty(slots, np.uint64)
+    copies = np.zeros(slots, np.int64)
     for k in range(count):
         key = keys[rows[k]]
         slot = np.int64(key >> np.uint64(20) & mask)
         while copies[slot] and first[slot] != key:
             slot = (slot + 1) & (slots - 1)
         if copies[slot]:
-            keys[rows[k]] = _scramble(key + np.uint64(copies[slot]) * STEP)
+            number = np.uint64(copies[slot])
+            keys[rows[k]] = _scramble(key + number * STEP)
         first[slot] = key
         copies[slot] += 1
 
@@ -218,7 +241,9 @@ def _change_copies_among(keys, rows, count):
 def ranks_of(planes, channels, largest, word, in_sphere, distinct):
     """Return the keys ``(N,)`` of one cloud as int64; arguments as for the functions above."""
     keys = np.empty(len(planes) // channels, np.uint64)
-    sphere = np.empty(channels + 1 if in_sphere else 0)
+    sphere = np.empty(0)
+    if in_sphere:
+        sphere = np.empty(channels + 1)
     if in_sphere:
         measure_sphere(planes, channels, largest, sphere)
     write_keys(planes, channels, word, sphere, keys)
@@ -242,8 +267,10 @@ def keys_of(points, clouds, channels, word, in_sphere, distinct):
     keys = np.empty(len(points) // channels, np.int64)
     size = len(keys) // clouds
     for cloud in range(clouds):
-        start, stop = cloud * size, (cloud + 1) * size
-        planes, largest = to_planes(points[start * channels : stop * channels], channels)
+        start = cloud * size
+        stop = start + size
+        cloud_points = points[start * channels : stop * channels]
+        planes, largest = to_planes(cloud_points, channels)
         ranks = ranks_of(planes, channels, largest, word, in_sphere, distinct)
         for i in range(size):  # the assignment of a slice takes seconds to compile
             keys[start + i] = ranks[i]
@@ -262,10 +289,12 @@ def are_finite(values):
 @jit_cached
 def spheres_of(points, clouds, channels):
     """Return the centres and radii ``(B·(C + 1),)`` of finite clouds; arguments as above."""
-    spheres = np.empty(clouds * (channels + 1))
+    length = channels + 1
+    spheres = np.empty(clouds * length)
     size = len(points) // clouds
     for cloud in range(clouds):
-        planes, largest = to_planes(points[cloud * size : (cloud + 1) * size], channels)
-        sphere = spheres[cloud * (channels + 1) : (cloud + 1) * (channels + 1)]
+        cloud_points = points[cloud * size : (cloud + 1) * size]
+        planes, largest = to_planes(cloud_points, channels)
+        sphere = spheres[cloud * length : (cloud + 1) * length]
         measure_sphere(planes, channels, largest, sphere)
     return spheres

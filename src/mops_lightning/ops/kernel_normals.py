@@ -15,7 +15,8 @@ def _rotate(matrix, vectors, p, q):
     """Make entry (p, q) of a symmetric 3×3 matrix 0 by a rotation, and turn the vectors with it."""
     if matrix[p, q] == 0.0:
         return
-    half = (matrix[q, q] - matrix[p, p]) / (2.0 * matrix[p, q])
+    difference = matrix[q, q] - matrix[p, p]
+    half = difference / (2.0 * matrix[p, q])
     tangent = 1.0 / (abs(half) + np.sqrt(half * half + 1.0))
     if half < 0.0:
         tangent = -tangent
@@ -46,7 +47,8 @@ def _smallest_axis(matrix, vectors):
         vectors[k, k] = 1.0
     for _ in range(SWEEPS):
         rest = abs(matrix[0, 1]) + abs(matrix[0, 2]) + abs(matrix[1, 2])
-        if rest <= 1e-17 * (matrix[0, 0] + matrix[1, 1] + matrix[2, 2]):
+        trace = matrix[0, 0] + matrix[1, 1] + matrix[2, 2]
+        if rest <= 1e-17 * trace:
             break
         _rotate(matrix, vectors, 0, 1)
         _rotate(matrix, vectors, 0, 2)
@@ -70,9 +72,10 @@ def _scatter(points, rows, mean, matrix):
     for j in range(len(rows)):
         row = rows[j]
         for a in range(3):
+            along_a = points[row, a] - mean[a]
             for b in range(a, 3):
-                product = (points[row, a] - mean[a]) * (points[row, b] - mean[b])
-                matrix[a, b] += product
+                along_b = points[row, b] - mean[b]
+                matrix[a, b] += along_a * along_b
     for a in range(3):
         for b in range(a):
             matrix[a, b] = matrix[b, a]
@@ -126,7 +129,8 @@ def ellipsoids(points, neighbours):
         above = 0.0
         squared = 0.0
         for axis in range(3):
-            lengths[axis] = np.sqrt(max(matrix[axis, axis], 0.0) / neighbours.shape[1])
+            variance = max(matrix[axis, axis], 0.0) / neighbours.shape[1]
+            lengths[axis] = np.sqrt(variance)
             normals[i, axis] = vectors[axis, smallest]
             offset = points[i, axis] - mean[axis]
             above += offset * vectors[axis, smallest]
@@ -134,5 +138,6 @@ def ellipsoids(points, neighbours):
         lengths.sort()
         numbers[i, :3] = lengths
         numbers[i, 3] = abs(above)
-        numbers[i, 4] = np.sqrt(max(squared - above * above, 0.0))
+        across = max(squared - above * above, 0.0)
+        numbers[i, 4] = np.sqrt(across)
     return numbers, normals

@@ -28,15 +28,20 @@ def morton_codes(points, clouds, spread):
         for axis in range(3):
             lowest = highest = part[axis]
             for i in range(size):
-                lowest, highest = min(lowest, part[3 * i + axis]), max(highest, part[3 * i + axis])
+                coordinate = part[3 * i + axis]
+                lowest = min(lowest, coordinate)
+                highest = max(highest, coordinate)
             low[axis] = lowest
-            side = max(side, np.float64(highest) - np.float64(lowest))
+            extent = np.float64(highest) - np.float64(lowest)
+            side = max(side, extent)
         side = max(side, 2.2250738585072014e-308)
         for i in range(size):
             code = 0
             for axis in range(3):
                 offset = np.float64(part[3 * i + axis]) - low[axis]
                 cell = np.int64(offset / side * (2**21 - 1))
-                code |= (spread[cell >> 11] << 33 | spread[cell & 2047]) << (2 - axis)
+                high_bits = spread[cell >> 11] << 33
+                low_bits = spread[cell & 2047]
+                code |= (high_bits | low_bits) << (2 - axis)
             codes[cloud * size + i] = code
     return codes

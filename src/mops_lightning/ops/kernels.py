@@ -22,7 +22,9 @@ from mops_lightning.ops.jit import (
     multiply_add,
 )
 
-LANES, FANOUT, PROBES = 64, 8, 8
+LANES = 64
+FANOUT = 8
+PROBES = 8
 """Maximum number of children of a node, and sampled coordinates per child for where to split."""
 
 
@@ -39,7 +41,8 @@ def all_finite(values):
 def write_distances(planes, size, start, stop, point, out):
     """Write the squared distances from a point to the rows from start to stop."""
     for axis in range(len(point)):
-        line, at = planes[axis * size + start : axis * size + stop], point[axis]
+        line = planes[axis * size + start : axis * size + stop]
+        at = point[axis]
         if axis == 0:
             for i in range(len(line)):
                 d = line[i] - at
@@ -54,10 +57,13 @@ def write_distances(planes, size, start, stop, point, out):
 def distance_to_box(boxes, node, point):
     """Return the squared distance from a point to the box of a node."""
     channels = len(point)
-    first = 2 * channels * node
+    lowest = 2 * channels * node
+    highest = lowest + channels
     total = zero = point.dtype.type(0)
     for axis in range(channels):
-        d = max(boxes[first + axis] - point[axis], point[axis] - boxes[first + channels + axis])
+        below = boxes[lowest + axis] - point[axis]
+        above = point[axis] - boxes[highest + axis]
+        d = max(below, above)
         d = max(d, zero)
         total = multiply_add(d, d, total)
     return total
@@ -87,17 +93,23 @@ def build_tree(planes, channels, leaf):
     # arrays is never touched.
     nodes = np.empty(8 * size, np.int64)
     boxes = np.empty(4 * channels * size, planes.dtype)
-    child, counts = np.empty(size, np.uint8), np.empty(FANOUT, np.int64)
-    places, moved_rows = np.empty(size, np.uint32), np.empty(size, np.uint32)
+    child = np.empty(size, np.uint8)
+    counts = np.empty(FANOUT, np.int64)
+    places = np.empty(size, np.uint32)
+    moved_rows = np.empty(size, np.uint32)
     moved = np.empty(size, planes.dtype)
-    nodes[0], nodes[1] = 0, size
-    node, known = 0, 1
+    nodes[0] = 0
+    nodes[1] = size
+    node = 0
+    known = 1
     while node < known:
         nodes[4 * node + 3] = 0
-        start, stop = nodes[4 * node], nodes[4 * node + 1]
+        start = nodes[4 * node]
+        stop = nodes[4 * node + 1]
         axis = _write_box(planes, channels, start, stop, boxes, node)
         box = 2 * channels * node + axis
-        low, high = boxes[box], boxes[box + channels]
+        low = boxes[box]
+        high = boxes[box + channels]
         if stop - start > leaf and low < high:
             line = planes[axis * size + start : axis * size + stop]
             _split(line, low, high, child, counts, places)
@@ -108,10 +120,12 @@ def build_tree(planes, channels, leaf):
                     start += counts[k]
                     nodes[4 * known + 1] = start
                     known += 1
-            nodes[4 * node + 3] = known - nodes[4 * node + 2]
+            first_child = nodes[4 * node + 2]
+            nodes[4 * node + 3] = known - first_child
             start = nodes[4 * node]
             for c in range(channels):
-                _move(planes[c * size + start : c * size + stop], places, moved)
+                coordinates = planes[c * size + start : c * size + stop]
+                _move(coordinates, places, moved)
             _move(rows[start:stop], places, moved_rows)
         node += 1
     return rows, nodes[: 4 * known], boxes
@@ -121,8 +135,10 @@ def build_tree(planes, channels, leaf):
 def _write_box(planes, channels, start, stop, boxes, node):
     """Write the box of a node and return its longest axis."""
     size = len(planes) // channels
-    longest, length = 0, planes.dtype.type(0)
-    lows, highs = np.empty(LANES, planes.dtype), np.empty(LANES, planes.dtype)
+    longest = 0
+    length = planes.dtype.type(0)
+    lows = np.empty(LANES, planes.dtype)
+    highs = np.empty(LANES, planes.dtype)
     for axis in range(channels):
         line = planes[axis * size + start : axis * size + stop]
         for lane in range(LANES):
@@ -132,13 +148,17 @@ def _write_box(planes, channels, start, stop, boxes, node):
             for i in range(len(part)):
                 lows[i] = part[i] if part[i] < lows[i] else lows[i]
                 highs[i] = part[i] if part[i] > highs[i] else highs[i]
-        low, high = lows[0], highs[0]
+        low = lows[0]
+        high = highs[0]
         for lane in range(LANES):
-            low, high = min(low, lows[lane]), max(high, highs[lane])
-        boxes[2 * channels * node + axis] = low
-        boxes[2 * channels * node + channels + axis] = high
+            low = min(low, lows[lane])
+            high = max(high, highs[lane])
+        box = 2 * channels * node + axis
+        boxes[box] = low
+        boxes[box + channels] = high
         if high - low > length:
-            longest, length = axis, high - low
+            longest = axis
+            length = high - low
     return longest
 
 
@@ -147,7 +167,8 @@ def _split(line, low, high, child, counts, places):
     """Write every point's child and its place in the order of children; count their points."""
     samples = np.empty(PROBES * FANOUT - 1, line.dtype)
     for i in range(len(samples)):
-        value = line[(2 * i + 1) * len(line) // (2 * len(samples))]
+        place = (2 * i + 1) * len(line) // (2 * len(samples))
+        value = line[place]
         j = i
         while j > 0 and samples[j - 1] > value:
             samples[j] = samples[j - 1]
@@ -158,8 +179,11 @@ def _split(line, low, high, child, counts, places):
         middle = low
     for i in range(len(line)):
         child[i] = 0
+    first_cut = samples[PROBES - 1]
     for k in range(FANOUT - 1):  # the first cut is below the highest coordinate
-        cut = samples[PROBES * (k + 1) - 1] if samples[PROBES - 1] < high else middle
+        cut = middle
+        if first_cut < high:
+            cut = samples[PROBES * (k + 1) - 1]
         for i in range(len(line)):
             child[i] += line[i] > cut
     for k in range(FANOUT):
@@ -187,12 +211,14 @@ def _move(line, places, moved):
 @jit
 def place_of(bits, wanted):
     """Return the first place of a value that occurs."""
-    start, matches = 0, 0
+    start = 0
+    matches = 0
     while not matches:
         part = bits[start : start + 64]
         for i in range(len(part)):
             matches += part[i] == wanted
-        start += 0 if matches else 64
+        if not matches:
+            start += 64
     while bits[start] != wanted:
         start += 1
     return start
@@ -218,37 +244,50 @@ def nearest(planes, queries, scratch, channels, leaf):
     rows, nodes, boxes = build_tree(planes, channels, leaf)
     known = len(nodes) // 4
     nearest_rows = np.empty(len(queries) // channels, np.int64)
-    distances, point = scratch.view(planes.dtype), np.empty(channels, planes.dtype)
-    bounds, stack = np.empty(known + FANOUT, planes.dtype), np.empty(known + FANOUT, np.int64)
+    distances = scratch.view(planes.dtype)
+    point = np.empty(channels, planes.dtype)
+    bounds = np.empty(known + FANOUT, planes.dtype)
+    stack = np.empty(known + FANOUT, np.int64)
     for query in range(len(nearest_rows)):
         for axis in range(channels):
             point[axis] = queries[query * channels + axis]
-        best, row = planes.dtype.type(np.inf), np.int64(size)
-        stack[0], bounds[0], depth = 0, 0, 1
+        best = planes.dtype.type(np.inf)
+        row = np.int64(size)
+        stack[0] = 0
+        bounds[0] = 0
+        depth = 1
         while depth:
             depth -= 1
             node = stack[depth]
             if bounds[depth] > best:
                 continue
-            if nodes[4 * node + 3]:
+            children = nodes[4 * node + 3]
+            if children:
                 bottom = depth
-                for k in range(nodes[4 * node + 2], nodes[4 * node + 2] + nodes[4 * node + 3]):
+                first_child = nodes[4 * node + 2]
+                for k in range(first_child, first_child + children):
                     bound = distance_to_box(boxes, k, point)
                     if bound <= best:  # the nearest child is visited first
                         place = depth
                         while place > bottom and bounds[place - 1] < bound:
-                            bounds[place], stack[place] = bounds[place - 1], stack[place - 1]
+                            bounds[place] = bounds[place - 1]
+                            stack[place] = stack[place - 1]
                             place -= 1
-                        bounds[place], stack[place] = bound, k
+                        bounds[place] = bound
+                        stack[place] = k
                         depth += 1
             else:
-                start, stop = nodes[4 * node], nodes[4 * node + 1]
+                start = nodes[4 * node]
+                stop = nodes[4 * node + 1]
                 write_distances(planes, size, start, stop, point, distances)
                 low = scratch[0]
                 for i in range(stop - start):
                     low = min(low, scratch[i])
                 i = place_of(scratch[: stop - start], low)
-                if distances[i] < best or (distances[i] == best and rows[start + i] < row):
-                    best, row = distances[i], rows[start + i]
+                is_nearer = distances[i] < best
+                is_tied = distances[i] == best
+                if is_nearer or (is_tied and rows[start + i] < row):
+                    best = distances[i]
+                    row = rows[start + i]
         nearest_rows[query] = row
     return nearest_rows

@@ -86,5 +86,6 @@ def are_finite(values: Array) -> bool:
     """
     if not values.size:
         return True
-    finite: bool = kernel_keys.are_finite(np.ascontiguousarray(values).reshape(-1))
+    flat = np.ascontiguousarray(values).reshape(-1)
+    finite: bool = kernel_keys.are_finite(flat)
     return finite

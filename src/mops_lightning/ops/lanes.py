@@ -15,11 +15,15 @@ from numba.core import cgutils
 
 LANES = 8
 
-WHOLE, WHOLE_BITS = 2.0**52, 0x4330000000000000
+WHOLE = 2.0**52
+WHOLE_BITS = 0x4330000000000000
 """The bits of 2⁵² + k, for whole k ≥ 0, are those of 2⁵² plus k."""
 
-INDEX, INTEGER, FLOAT = ir.IntType(32), ir.IntType(64), ir.DoubleType()
-INTEGERS, FLOATS = ir.VectorType(INTEGER, LANES), ir.VectorType(FLOAT, LANES)
+INDEX = ir.IntType(32)
+INTEGER = ir.IntType(64)
+FLOAT = ir.DoubleType()
+INTEGERS = ir.VectorType(INTEGER, LANES)
+FLOATS = ir.VectorType(FLOAT, LANES)
 
 
 def _constant(kind, value):
@@ -31,13 +35,15 @@ def _spread(builder, value):
     vector = ir.VectorType(value.type, LANES)
     unknown = ir.Constant(vector, ir.Undefined)
     first = builder.insert_element(unknown, value, INDEX(0))
-    return builder.shuffle_vector(first, unknown, _constant(ir.VectorType(INDEX, LANES), 0))
+    zeros = _constant(ir.VectorType(INDEX, LANES), 0)
+    return builder.shuffle_vector(first, unknown, zeros)
 
 
 def _call(builder, name, result, operand):
     """Call a function of LLVM with one operand."""
     function = ir.FunctionType(result, [operand.type])
-    return builder.call(builder.module.declare_intrinsic(name, (), function), [operand])
+    intrinsic = builder.module.declare_intrinsic(name, (), function)
+    return builder.call(intrinsic, [operand])
 
 
 class _Arrays:
@@ -46,8 +52,10 @@ class _Arrays:
     def __init__(self, context, builder, signature, arguments):
         planes, self.total, self.axes, crowding = arguments[:4]
         self.builder = builder
-        self.planes = context.make_array(signature.args[0])(context, builder, planes).data
-        self.crowding = context.make_array(signature.args[3])(context, builder, crowding).data
+        make_planes = context.make_array(signature.args[0])
+        make_crowding = context.make_array(signature.args[3])
+        self.planes = make_planes(context, builder, planes).data
+        self.crowding = make_crowding(context, builder, crowding).data
 
     def crowding_at(self, place):
         """Return a pointer to the crowding of eight points."""
@@ -58,9 +66,10 @@ class _Arrays:
         """Return the squares of the differences of eight points to another one along an axis."""
         builder = self.builder
         plane = builder.mul(axis, self.total)
-        pointer = builder.gep(self.planes, [builder.add(plane, place)])
-        here = builder.load(builder.bitcast(pointer, FLOATS.as_pointer()), align=8)
-        there = builder.load(builder.gep(self.planes, [builder.add(plane, other)]))
+        here_at = builder.gep(self.planes, [builder.add(plane, place)])
+        there_at = builder.gep(self.planes, [builder.add(plane, other)])
+        here = builder.load(builder.bitcast(here_at, FLOATS.as_pointer()), align=8)
+        there = builder.load(there_at)
         difference = builder.fsub(here, _spread(builder, there))
         return builder.fmul(difference, difference)
 
@@ -68,26 +77,34 @@ class _Arrays:
         """Return the squared distances of eight points to another one, summed axis by axis."""
         builder = self.builder
         squares = cgutils.alloca_once(builder, FLOATS)
-        first = self.square(INTEGER(0), place, other)
-        second = builder.fadd(first, self.square(INTEGER(1), place, other))
-        builder.store(builder.fadd(second, self.square(INTEGER(2), place, other)), squares)
-        with cgutils.for_range_slice(builder, INTEGER(3), self.axes, INTEGER(1)) as (axis, _):
+        along_x = self.square(INTEGER(0), place, other)
+        along_y = self.square(INTEGER(1), place, other)
+        along_z = self.square(INTEGER(2), place, other)
+        in_plane = builder.fadd(along_x, along_y)
+        builder.store(builder.fadd(in_plane, along_z), squares)
+        more_axes = cgutils.for_range_slice(builder, INTEGER(3), self.axes, INTEGER(1))
+        with more_axes as (axis, _):
             more = self.square(axis, place, other)
-            builder.store(builder.fadd(builder.load(squares), more), squares)
+            total = builder.load(squares)
+            builder.store(builder.fadd(total, more), squares)
         return builder.load(squares)
 
 
 def _weights(builder, squares, inverse, scale):
     """Return ⌊(1 − d/reach)⁸ · scale⌋, 0 from the reach on; a product with 1/reach is faster."""
-    zero, one = _constant(FLOATS, 0.0), _constant(FLOATS, 1.0)
+    zero = _constant(FLOATS, 0.0)
+    one = _constant(FLOATS, 1.0)
+    whole = _constant(FLOATS, WHOLE)
     distances = _call(builder, f"llvm.sqrt.v{LANES}f64", FLOATS, squares)
     shares = builder.fsub(one, builder.fmul(distances, inverse))
-    shares = builder.select(builder.fcmp_ordered(">", shares, zero), shares, zero)
+    is_positive = builder.fcmp_ordered(">", shares, zero)
+    shares = builder.select(is_positive, shares, zero)
     shares = builder.fmul(shares, shares)
     shares = builder.fmul(shares, shares)
-    scaled = builder.fmul(builder.fmul(shares, shares), scale)
+    shares = builder.fmul(shares, shares)
+    scaled = builder.fmul(shares, scale)
     floors = _call(builder, f"llvm.floor.v{LANES}f64", FLOATS, scaled)
-    bits = builder.bitcast(builder.fadd(floors, _constant(FLOATS, WHOLE)), INTEGERS)
+    bits = builder.bitcast(builder.fadd(floors, whole), INTEGERS)
     return builder.sub(bits, _constant(INTEGERS, WHOLE_BITS))
 
 
@@ -107,18 +124,23 @@ def _over_lanes(start_value, reduction, change):
 
     def typed(typing, planes, total, axes, crowding, start, stop, other, inverse, scale):
         whole, real = types.int64, types.float64
-        signature = whole(planes, whole, whole, crowding, whole, whole, whole, real, real)
+        places = (whole, whole, whole)
+        signature = whole(planes, whole, whole, crowding, *places, real, real)
 
         def generate(context, builder, signature, arguments):
             arrays = _Arrays(context, builder, signature, arguments)
             start, stop, other, inverse, scale = arguments[4:]
-            inverse, scale = _spread(builder, inverse), _spread(builder, scale)
+            inverse = _spread(builder, inverse)
+            scale = _spread(builder, scale)
             results = cgutils.alloca_once_value(builder, _constant(INTEGERS, start_value))
-            with cgutils.for_range_slice(builder, start, stop, INTEGER(LANES)) as (place, _):
-                weights = _weights(builder, arrays.squares(place, other), inverse, scale)
+            blocks = cgutils.for_range_slice(builder, start, stop, INTEGER(LANES))
+            with blocks as (place, _):
+                squares = arrays.squares(place, other)
+                weights = _weights(builder, squares, inverse, scale)
                 pointer = arrays.crowding_at(place)
                 crowding = builder.load(pointer, align=8)
-                changed, result = change(builder, crowding, weights, builder.load(results))
+                so_far = builder.load(results)
+                changed, result = change(builder, crowding, weights, so_far)
                 builder.store(changed, pointer, align=8)
                 builder.store(result, results)
             name = f"llvm.vector.reduce.{reduction}.v{LANES}i64"

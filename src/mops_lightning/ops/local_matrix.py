@@ -57,29 +57,36 @@ class LocalMatrix(NamedTuple):
     def sparse(self, threshold: float = 0.01) -> Tensor:
         """Return S in coordinate (COO) format, as ``SamplingMatrix.sparse``."""
         with torch.no_grad():
-            kept = self.weights >= threshold
-            kept = kept.scatter(2, self.weights.argmax(2, keepdim=True), True)
-            values = self.weights.where(kept, 0.0)
+            largest = self.weights.argmax(2, keepdim=True)
+            is_kept = self.weights >= threshold
+            is_kept = is_kept.scatter(2, largest, True)
+            values = self.weights.where(is_kept, 0.0)
             values = values / values.sum(2, keepdim=True)
-            cloud, column, _ = places = kept.nonzero(as_tuple=True)
+            places = is_kept.nonzero(as_tuple=True)
+            cloud, column, _ = places
             indices = torch.stack([cloud, self.rows[places], column])
             shape = (len(values), self.number, self.m)
-            return torch.sparse_coo_tensor(
-                indices, values[places], shape, check_invariants=False
-            ).coalesce()
+            entries = values[places]
+            matrix = torch.sparse_coo_tensor(indices, entries, shape, check_invariants=False)
+            return matrix.coalesce()
 
     def leftmost(self, m: int) -> "LocalMatrix":
         """Return the matrix of the first ``m`` columns."""
-        return self._replace(weights=self.weights[:, :m], rows=self.rows[:, :m])
+        weights = self.weights[:, :m]
+        rows = self.rows[:, :m]
+        return self._replace(weights=weights, rows=rows)
 
     def first_cloud(self) -> "LocalMatrix":
         """Return the matrix of the first cloud, as a batch of one."""
-        return self._replace(weights=self.weights[:1], rows=self.rows[:1])
+        weights = self.weights[:1]
+        rows = self.rows[:1]
+        return self._replace(weights=weights, rows=rows)
 
     def nonzero_counts(self, threshold: float = 0.01) -> Tensor:
         """Count the entries of every column that reach ``threshold``: ``(B, M)``."""
         with torch.no_grad():
-            return (self.weights >= threshold).sum(2).to(self.weights.dtype)
+            is_large = self.weights >= threshold
+            return is_large.sum(2).to(self.weights.dtype)
 
     def gram(self) -> Tensor:
         """Return SᵀS ``(B, M, M)``, as ``SamplingMatrix.gram``."""
@@ -92,19 +99,23 @@ class LocalMatrix(NamedTuple):
         Only pairs of entries of one point are multiplied.
         """
         clouds, m, k = self.weights.shape
-        cloud = torch.arange(clouds, device=self.rows.device)[:, None, None]
-        point, order = (cloud * self.number + self.rows).flatten().sort(stable=True)
+        cloud = torch.arange(clouds, device=self.rows.device)
+        starts_of_clouds = cloud[:, None, None] * self.number
+        points = (starts_of_clouds + self.rows).flatten()
+        point, order = points.sort(stable=True)
         weights = self.weights.flatten()[order]
         columns = order // k  # counted through all clouds
         # Entry e of a point with g entries is in g pairs, with all entries from the point's first.
         sizes = torch.unique_consecutive(point, return_counts=True)[1]
         starts = sizes.cumsum(0) - sizes
         pairs = sizes.repeat_interleave(sizes)  # of every entry
-        entry = torch.arange(len(point), device=point.device).repeat_interleave(pairs)
-        within = torch.arange(len(entry), device=point.device) - (
-            (pairs.cumsum(0) - pairs).repeat_interleave(pairs)
-        )
-        other = starts.repeat_interleave(sizes).repeat_interleave(pairs) + within
+        entries = torch.arange(len(point), device=point.device)
+        entry = entries.repeat_interleave(pairs)
+        first_pairs = (pairs.cumsum(0) - pairs).repeat_interleave(pairs)
+        within = torch.arange(len(entry), device=point.device) - first_pairs
+        first_entries = starts.repeat_interleave(sizes).repeat_interleave(pairs)
+        other = first_entries + within
         places = columns[entry] * m + columns[other] % m
+        products = weights[entry] * weights[other]
         result = weights.new_zeros(clouds * m * m)
-        return result.index_add(0, places, weights[entry] * weights[other]).view(clouds, m, m)
+        return result.index_add(0, places, products).view(clouds, m, m)

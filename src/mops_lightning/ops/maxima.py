@@ -23,6 +23,6 @@ def max_of_rows(features: Tensor, rows: Tensor) -> Tensor:
             return features.gather(1, winners)
     clouds, n, channels = features.shape
     starts = torch.arange(clouds, device=rows.device) * n
-    rows_of_all = rows + starts[:, None, None]
-    best = F.embedding_bag(rows_of_all.flatten(0, 1), features.flatten(0, 1), mode="max")
+    rows_of_all = (rows + starts[:, None, None]).flatten(0, 1)
+    best = F.embedding_bag(rows_of_all, features.flatten(0, 1), mode="max")
     return best.view(clouds, -1, channels)

@@ -105,7 +105,8 @@ def chamfer_distance(points: Tensor, others: Tensor) -> Tensor:
 
 
 def _check_shapes(queries: Tensor, points: Tensor) -> None:
-    if queries.ndim != 3 or points.ndim != 3 or queries.shape[::2] != points.shape[::2]:
+    have_three_dimensions = queries.ndim == 3 and points.ndim == 3
+    if not have_three_dimensions or queries.shape[::2] != points.shape[::2]:
         raise UserError(
             "queries (B, M, C) and points (B, N, C) must agree in B and C, "
             f"got {tuple(queries.shape)} and {tuple(points.shape)}."
@@ -126,13 +127,18 @@ def _search(queries: Tensor, points: Tensor, k: int) -> Tensor:
 def search_in_blocks(queries: Tensor, points: Tensor, k: int) -> Tensor:
     """Find the k nearest rows ``(B, M, k)`` in torch; planes keep every step vectorised."""
     dtype = distance_dtype(points)
-    rows = to_planes(queries.to(dtype))[..., None]  # (C, B, M, 1)
-    columns = to_planes(points.to(dtype))[:, :, None]  # (C, B, 1, N)
+    query_planes = to_planes(queries.to(dtype))
+    rows = query_planes[..., None]  # (C, B, M, 1)
+    point_planes = to_planes(points.to(dtype))
+    columns = point_planes[:, :, None]  # (C, B, 1, N)
     clouds, m = queries.shape[:2]
     width = points.shape[1]
-    limit = BLOCK["cpu" if points.device.type == "cpu" else "other"]
+    limit = BLOCK["other"]
+    if points.device.type == "cpu":
+        limit = BLOCK["cpu"]
     height = max(1, min(m, limit // width))
-    depth = max(1, min(clouds, limit // (height * width)))
+    clouds_at_once = limit // (height * width)
+    depth = max(1, min(clouds, clouds_at_once))
     indices = torch.empty(clouds, m, k, dtype=torch.int64, device=points.device)
     buffers = rows.new_empty(2, depth * height * width)  # one allocation saves a third of the time
     for cloud in range(0, clouds, depth):
@@ -141,14 +147,17 @@ def search_in_blocks(queries: Tensor, points: Tensor, k: int) -> Tensor:
             some_rows = slice(row, row + height)
             block = rows[:, some_clouds, some_rows]
             shape = (*block.shape[1:3], width)
-            total, difference = buffers[:, : math.prod(shape)].view(2, *shape)
+            used = buffers[:, : math.prod(shape)]
+            total, difference = used.view(2, *shape)
             torch.sub(columns[0, some_clouds], block[0], out=total)
             total.mul_(total)
             for axis in range(1, len(rows)):
-                torch.sub(columns[axis, some_clouds], block[axis], out=difference)
+                column = columns[axis, some_clouds]
+                torch.sub(column, block[axis], out=difference)
                 total.addcmul_(difference, difference)
             winners = _smallest(total.view(-1, width), k)
-            indices[some_clouds, some_rows] = winners.view(*shape[:2], k)
+            winners = winners.view(*shape[:2], k)
+            indices[some_clouds, some_rows] = winners
     return indices
 
 

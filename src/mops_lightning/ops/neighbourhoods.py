@@ -14,7 +14,8 @@ SCALES = (6, 12, 24)
 PLANE = 12
 """The scale whose planes give the normals; small_gicp estimates them from as many points."""
 
-PER_SCALE, PER_POINT = 8, 4
+PER_SCALE = 8
+PER_POINT = 4
 FEATURES = PER_SCALE * len(SCALES) + PER_POINT
 """How many numbers describe a point."""
 
@@ -50,37 +51,47 @@ def describe_neighbourhoods(points: Values) -> Neighbourhoods:
         points: ``(N, 3)`` finite, N ≥ 1.
     """
     centred = points - points.mean(0)
-    centred = centred / (float(np.linalg.norm(centred, axis=1).mean()) or 1.0)
+    mean_distance = float(np.linalg.norm(centred, axis=1).mean())
+    centred = centred / (mean_distance or 1.0)
     most = min(SCALES[-1], len(points))
     distances, nearest = cKDTree(centred).query(centred, k=most)
     distances = np.reshape(distances, (len(points), most))
     nearest = np.reshape(nearest, (len(points), most))
-    spacing = float(np.median(distances[:, min(SCALES[0], most) - 1])) or 1.0
+    last_of_finest = min(SCALES[0], most) - 1
+    spacing = float(np.median(distances[:, last_of_finest])) or 1.0
 
     lengths: list[Values] = []
     normals = np.empty_like(centred)
     for k in SCALES:
-        numbers, directions = ellipsoids(centred, np.ascontiguousarray(nearest[:, :k]))
-        lengths += [numbers, distances[:, min(k, most) - 1, None]]
+        neighbours = np.ascontiguousarray(nearest[:, :k])
+        numbers, directions = ellipsoids(centred, neighbours)
+        last = min(k, most) - 1
+        lengths += [numbers, distances[:, last, None]]
         if k == PLANE:
             normals = directions
-    columns = [np.log(np.concatenate(lengths, axis=1) / spacing + LEAST)]
-    columns += [_differences(normals, nearest[:, :k]) for k in SCALES]
+    relative = np.concatenate(lengths, axis=1) / spacing
+    columns = [np.log(relative + LEAST)]
+    for k in SCALES:
+        columns.append(_differences(normals, nearest[:, :k]))
     columns.append(_levers(centred, normals, spacing))
     return Neighbourhoods(np.concatenate(columns, axis=1), normals)
 
 
 def _differences(normals: Values, nearest: NDArray[np.int64]) -> Values:
     """Return the mean and the largest difference ``(N, 2)`` of normals, as logarithms."""
-    cosines = np.abs(np.einsum("ni,nki->nk", normals, normals[nearest]))
+    near_normals = normals[nearest]
+    cosines = np.abs(np.einsum("ni,nki->nk", normals, near_normals))
     least = np.stack([cosines.mean(1), cosines.min(1)], axis=1)
-    return np.log(1 + LEAST - np.minimum(least, 1))
+    differences = 1 - np.minimum(least, 1)
+    return np.log(differences + LEAST)
 
 
 def _levers(centred: Values, normals: Values, spacing: float) -> Values:
     """Return what depends on the place of a point in the cloud, ``(N, PER_POINT)``."""
     radius = np.linalg.norm(centred, axis=1)
     along = np.abs(np.einsum("ni,ni->n", centred, normals))
-    lever = np.linalg.norm(np.cross(centred, normals), axis=1)
+    across = np.cross(centred, normals)
+    lever = np.linalg.norm(across, axis=1)
+    log_lever = np.log(lever + LEAST)
     everywhere = np.full(len(centred), np.log(spacing))
-    return np.stack([radius, along, np.log(lever + LEAST), everywhere], axis=1)
+    return np.stack([radius, along, log_lever, everywhere], axis=1)

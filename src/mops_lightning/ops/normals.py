@@ -30,11 +30,13 @@ def estimate_normals(
     """
     centred = points - points.mean(0)
     tree = cKDTree(centred)
+    k = min(neighbours, len(points))
     normals = np.empty_like(centred)
     for start in range(0, len(points), PART):
         part = centred[start : start + PART]
-        nearest = np.asarray(tree.query(part, k=min(neighbours, len(points)))[1], np.int64)
-        normals[start : start + PART] = plane_normals(centred, nearest.reshape(len(part), -1))
+        nearest = np.asarray(tree.query(part, k=k)[1], np.int64)
+        nearest = nearest.reshape(len(part), -1)
+        normals[start : start + PART] = plane_normals(centred, nearest)
     return normals
 
 
@@ -46,6 +48,7 @@ def upward_normals(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """
     normals = estimate_normals(points)
     x, y, z = normals.T
-    is_down = (z < 0) | ((z == 0) & ((y < 0) | ((y == 0) & (x < 0))))
+    is_down_in_plane = (y < 0) | ((y == 0) & (x < 0))
+    is_down = (z < 0) | ((z == 0) & is_down_in_plane)
     upward: NDArray[np.float64] = np.where(is_down[:, None], -normals, normals)
     return upward

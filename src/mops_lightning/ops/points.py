@@ -36,7 +36,8 @@ def as_tensor(name: str, value: Any) -> Tensor:
 
 def cloud_sizes(number: int, batch: Tensor, name: str = "batch") -> Tensor:
     """Return the number of points ``(B,)`` of every cloud; see ``ops.batches.cloud_sizes``."""
-    return torch.from_numpy(batches.cloud_sizes(number, batch.cpu().numpy(), name))
+    numbers = batches.cloud_sizes(number, batch.cpu().numpy(), name)
+    return torch.from_numpy(numbers)
 
 
 def gather_points(points: Tensor, indices: Tensor) -> Tensor:
@@ -50,7 +51,8 @@ def gather_points(points: Tensor, indices: Tensor) -> Tensor:
         ``(B, M, C)`` or ``(B, M, k, C)``; gradients flow to ``points``.
     """
     channels = points.shape[2]
-    rows = indices.flatten(1)[..., None].expand(-1, -1, channels)
+    rows = indices.flatten(1)[..., None]
+    rows = rows.expand(-1, -1, channels)
     return points.gather(1, rows).view(*indices.shape, channels)
 
 
@@ -64,10 +66,13 @@ def normalize_unit_sphere(points: Tensor) -> Tensor:
         ``(B, N, C)``; a cloud whose points all coincide becomes zeros.
     """
     centred = points - points.mean(1, keepdim=True)
-    radius = torch.linalg.vector_norm(centred, dim=2, keepdim=True).amax(1, keepdim=True)
+    distances = torch.linalg.vector_norm(centred, dim=2, keepdim=True)
+    radius = distances.amax(1, keepdim=True)
     # The mean of equal numbers can have a rounding error, which must not be scaled up.
-    flat = (points == points[:, :1]).all(2, keepdim=True).all(1, keepdim=True) | (radius == 0)
-    return torch.where(flat, 0.0, centred / torch.where(flat, 1.0, radius))
+    is_as_first = (points == points[:, :1]).all(2, keepdim=True)
+    has_no_size = is_as_first.all(1, keepdim=True) | (radius == 0)
+    divisor = torch.where(has_no_size, 1.0, radius)
+    return torch.where(has_no_size, 0.0, centred / divisor)
 
 
 class UnitSphere(NamedTuple):
@@ -83,18 +88,21 @@ class UnitSphere(NamedTuple):
     def around(cls, points: NDArray[np.float64]) -> "UnitSphere":
         """Measure a cloud ``(n, 3)``."""
         centre = points.sum(0) / len(points)
-        return cls(centre, largest_distance(points, centre) or 1.0)
+        radius = largest_distance(points, centre) or 1.0
+        return cls(centre, radius)
 
     def normalise(self, points: NDArray[np.float64]) -> Tensor:
         """Return points ``(n, 3)`` of the cloud in the unit sphere, float32, as for training."""
         unit = np.empty(points.shape, np.float32)
         for block in _blocks(len(points)):
-            unit[block] = (points[block] - self.centre) / self.radius
+            centred = points[block] - self.centre
+            unit[block] = centred / self.radius
         return torch.from_numpy(unit)
 
     def restore(self, points: Tensor) -> NDArray[np.float64]:
         """Return points ``(n, 3)`` of the unit sphere in the file's own unit."""
-        restored: NDArray[np.float64] = points.double().numpy() * self.radius + self.centre
+        unit = points.double().numpy()
+        restored: NDArray[np.float64] = unit * self.radius + self.centre
         return restored
 
 
@@ -102,7 +110,8 @@ def largest_distance(points: NDArray[np.float64], centre: NDArray[np.float64]) -
     """Return the largest distance of points ``(n, 3)`` from ``centre`` ``(3,)``."""
     largest = 0.0
     for block in _blocks(len(points)):
-        distances = np.linalg.norm(points[block] - centre, axis=1)
+        centred = points[block] - centre
+        distances = np.linalg.norm(centred, axis=1)
         largest = np.maximum(largest, distances.max())
     return float(largest)
 

@@ -39,7 +39,10 @@ def restrict_autocast_to_pointwise(device: str) -> Iterator[None]:
             yield
         return
     mixed = torch.is_autocast_enabled(device)
-    token = _POINTWISE.set(torch.get_autocast_dtype(device) if mixed else _POINTWISE.get())
+    dtype = _POINTWISE.get()
+    if mixed:
+        dtype = torch.get_autocast_dtype(device)
+    token = _POINTWISE.set(dtype)
     try:
         with full_precision(device):
             yield
@@ -49,7 +52,9 @@ def restrict_autocast_to_pointwise(device: str) -> Iterator[None]:
 
 def pointwise_autocast_dtype() -> torch.dtype | None:
     """Return the dtype of ``pointwise_autocast``, or None without mixed precision."""
-    return None if torch.compiler.is_compiling() else _POINTWISE.get()
+    if torch.compiler.is_compiling():
+        return None
+    return _POINTWISE.get()
 
 
 def pointwise_autocast(device: str) -> AbstractContextManager[Any]:
@@ -59,4 +64,6 @@ def pointwise_autocast(device: str) -> AbstractContextManager[Any]:
         device: device type, such as ``cuda``.
     """
     dtype = pointwise_autocast_dtype()
-    return nullcontext() if dtype is None else torch.autocast(device, dtype=dtype)
+    if dtype is None:
+        return nullcontext()
+    return torch.autocast(device, dtype=dtype)

@@ -59,7 +59,11 @@ class PropagationMap(NamedTuple):
 
 
 def propagation_map(
-    points: Any, sampled: Any, k: int = 1, batch: Any = None, sampled_batch: Any = None
+    points: Any,
+    sampled: Any,
+    k: int = 1,
+    batch: Any = None,
+    sampled_batch: Any = None,
 ) -> PropagationMap:
     """Find the k nearest sampled points of every point, and their weights.
 
@@ -89,10 +93,14 @@ def propagation_map(
     """
     points = as_tensor("points", points)
     sampled = as_tensor("sampled", sampled)
-    if (batch is None) != (sampled_batch is None):
+    has_batch = batch is not None
+    has_sampled_batch = sampled_batch is not None
+    if has_batch != has_sampled_batch:
         raise UserError("batch and sampled_batch belong together: give both or none.")
-    is_flat = batch is not None or points.ndim == 2
-    ndim = 2 if is_flat else 3
+    is_flat = has_batch or points.ndim == 2
+    ndim = 3
+    if is_flat:
+        ndim = 2
     _check_kind("points", points, ndim)
     _check_kind("sampled", sampled, ndim)
     clouds = _split_clouds("batch", points, batch)
@@ -111,15 +119,19 @@ def propagation_map(
         if is_flat:
             start += len(sample)
     if is_flat:
-        return PropagationMap(torch.cat(all_rows), torch.cat(all_weights), len(sampled))
-    return PropagationMap(torch.stack(all_rows), torch.stack(all_weights), sampled.shape[1])
+        rows_of_all = torch.cat(all_rows)
+        weights_of_all = torch.cat(all_weights)
+        return PropagationMap(rows_of_all, weights_of_all, len(sampled))
+    m = sampled.shape[1]
+    return PropagationMap(torch.stack(all_rows), torch.stack(all_weights), m)
 
 
 def _check_kind(name: str, points: Tensor, ndim: int) -> None:
     if points.ndim != ndim or not points.is_floating_point():
+        shape = tuple(points.shape)
         raise UserError(
             f"{name} must be floating point of {ndim} dimensions, got {points.dtype} of shape "
-            f"{tuple(points.shape)}."
+            f"{shape}."
         )
 
 
@@ -146,7 +158,8 @@ def mapper(sampled: Any, k: int = 1) -> Callable[[Any], PropagationMap]:
         tree = cKDTree(sampled.double().numpy())
 
     def map_part(points: Any) -> PropagationMap:
-        rows, weights = _search(as_tensor("points", points), sampled, k, tree)
+        part = as_tensor("points", points)
+        rows, weights = _search(part, sampled, k, tree)
         return PropagationMap(rows, weights, len(sampled))
 
     return map_part
@@ -159,13 +172,17 @@ def _search(points: Tensor, sampled: Tensor, k: int, tree: Any = None) -> tuple[
     dtype = torch.promote_types(points.dtype, sampled.dtype)
     dtype_of_weights = torch.promote_types(dtype, torch.float32)
     if k == 1:
-        _, nearest_rows = nearest(points.to(dtype)[None], sampled.to(dtype)[None])
+        dense = points.to(dtype)
+        sparse = sampled.to(dtype)
+        _, nearest_rows = nearest(dense[None], sparse[None])
         rows = nearest_rows[0, :, None]
         return rows, torch.ones_like(rows, dtype=dtype_of_weights)
     if tree is None:
         tree = cKDTree(sampled.double().cpu().numpy())
-    near = _nearest_in_tree(tree, points.double().cpu().numpy(), k)
-    squared, rows = (torch.from_numpy(array).to(points.device) for array in near)
+    coordinates = points.double().cpu().numpy()
+    squared_array, row_array = _nearest_in_tree(tree, coordinates, k)
+    squared = torch.from_numpy(squared_array).to(points.device)
+    rows = torch.from_numpy(row_array).to(points.device)
     # Relative to the nearest point, because 1/d² may be infinite.
     nearest_squared = squared[:, :1]
     is_at_point = (squared == 0).to(squared)
@@ -175,15 +192,19 @@ def _search(points: Tensor, sampled: Tensor, k: int, tree: Any = None) -> tuple[
 
 
 def _check_search(points: Tensor, sampled: Tensor, k: int) -> None:
-    if points.shape[1] != sampled.shape[1]:
+    channels = points.shape[1]
+    sampled_channels = sampled.shape[1]
+    if channels != sampled_channels:
         raise UserError(
-            f"points and sampled must have the same number of coordinates, got {points.shape[1]} "
-            f"and {sampled.shape[1]}."
+            f"points and sampled must have the same number of coordinates, got {channels} "
+            f"and {sampled_channels}."
         )
     most = len(sampled)
     if not 1 <= k <= most:
         raise UserError(f"k must be from 1 to the number of sampled points, {most}, got {k}.")
-    if not (bool(torch.isfinite(points).all()) and bool(torch.isfinite(sampled).all())):
+    are_finite = bool(torch.isfinite(points).all())
+    are_sampled_finite = bool(torch.isfinite(sampled).all())
+    if not (are_finite and are_sampled_finite):
         raise UserError("points and sampled must be finite, got NaN or infinity.")
 
 
@@ -197,16 +218,19 @@ def _nearest_in_tree(
     """
     asked = min(k + MORE, tree.n)
     _, rows_in_tree = tree.query(points, k=asked)
-    rows = np.asarray(rows_in_tree, np.int64).reshape(len(points), asked)
+    rows = np.asarray(rows_in_tree, np.int64)
+    rows = rows.reshape(len(points), asked)
     squared, rows = _by_distance(tree, points, rows)
     if asked < tree.n:
         farthest = squared[:, k - 1]
-        tied = np.flatnonzero(squared[:, -1] <= farthest * (1 + ROUNDING))
+        last = squared[:, -1]
+        tied = np.flatnonzero(last <= farthest * (1 + ROUNDING))
         reach = np.sqrt(farthest[tied]) * (1 + ROUNDING)
         within = tree.query_ball_point(points[tied], reach)
         for number, candidates in zip(tied, within, strict=True):
-            of_point = np.asarray(candidates, np.int64)[None]
-            near_squared, near_rows = _by_distance(tree, points[number, None], of_point)
+            point = points[number, None]
+            rows_within = np.asarray(candidates, np.int64)
+            near_squared, near_rows = _by_distance(tree, point, rows_within[None])
             squared[number, :k] = near_squared[0, :k]
             rows[number, :k] = near_rows[0, :k]
     return squared[:, :k], rows[:, :k]
@@ -216,9 +240,11 @@ def _by_distance(
     tree: Any, points: NDArray[np.float64], rows: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return squared distances ``(N, n)`` and rows, by distance and by row in case of ties."""
-    squared = np.square(tree.data[rows] - points[:, None]).sum(2)
+    apart = tree.data[rows] - points[:, None]
+    squared = np.square(apart).sum(2)
     order = np.lexsort((rows, squared), axis=1)
-    return np.take_along_axis(squared, order, 1), np.take_along_axis(rows, order, 1)
+    ordered = np.take_along_axis(squared, order, 1)
+    return ordered, np.take_along_axis(rows, order, 1)
 
 
 def propagate(values: Any, map: Any, mean: bool = False, fill: Any = None) -> Any:
@@ -265,11 +291,13 @@ def propagate(values: Any, map: Any, mean: bool = False, fill: Any = None) -> An
             "such as fill=0."
         )
     rows = rows.clamp_min(0)
+    shape_of_clouds = map.rows.shape[:-1]
     shape_of_value = numbers.shape[map.rows.ndim - 1 :]
     table = numbers.reshape(-1, *shape_of_value)
     weights = map.weights.to(numbers.device).reshape(rows.shape)
     if rows.shape[1] == 1:
-        result = _signed(table)[rows[:, 0]].view(table.dtype)
+        nearest_rows = rows[:, 0]
+        result = _signed(table)[nearest_rows].view(table.dtype)
     elif mean or table.is_floating_point():
         result = _mean(table, rows, weights)
     else:
@@ -277,7 +305,7 @@ def propagate(values: Any, map: Any, mean: bool = False, fill: Any = None) -> An
     if has_missing:
         value = _fill_value(fill, table.dtype).to(table.device)
         _signed(result)[is_missing] = _signed(value)
-    result = result.reshape(*map.rows.shape[:-1], *shape_of_value)
+    result = result.reshape(*shape_of_clouds, *shape_of_value)
     if isinstance(values, Tensor):
         return result
     return result.numpy()
@@ -299,7 +327,8 @@ def interpolate(values: Tensor, points: Tensor, queries: Tensor, k: int = 3) -> 
         ``(B, N, C)``.
     """
     clouds, m, channels = values.shape
-    squared, rows = k_nearest(queries, points, min(k, points.shape[1]))
+    neighbours = min(k, points.shape[1])
+    squared, rows = k_nearest(queries, points, neighbours)
     weights = 1 / (squared + CLOSE)
     weights = weights / weights.sum(2, keepdim=True)
     starts = torch.arange(clouds, device=rows.device) * m
@@ -318,19 +347,22 @@ def _rows(map: PropagationMap, values: Tensor) -> Tensor:
     """Return the rows ``(T, k)`` of values whose clouds are one after the other; check both."""
     clouds = map.rows.shape[:-2]
     wanted = (*clouds, map.m)
-    if tuple(values.shape[: len(wanted)]) != wanted:
+    given = tuple(values.shape)
+    if given[: len(wanted)] != wanted:
         raise UserError(
             f"values must have one row for each of {map.m} sampled points, shape "
-            f"{wanted}, got {tuple(values.shape)}."
+            f"{wanted}, got {given}."
         )
     rows = map.rows.long()
     if rows.numel():
         least = int(rows.min())
         most = int(rows.max())
-        if least < -1 or most >= map.m:
-            raise UserError(f"map: rows must be from -1 to {map.m - 1}, got {least} to {most}.")
+        last = map.m - 1
+        if least < -1 or most > last:
+            raise UserError(f"map: rows must be from -1 to {last}, got {least} to {most}.")
     if clouds:
-        starts = map.m * torch.arange(clouds[0], device=rows.device)
+        numbers = torch.arange(clouds[0], device=rows.device)
+        starts = map.m * numbers
         rows = rows + starts[:, None, None]
     return rows.reshape(-1, rows.shape[-1])
 
@@ -357,7 +389,8 @@ def _fill_value(fill: Any, dtype: torch.dtype) -> Tensor:
     except (TypeError, ValueError, OverflowError):
         raise UserError(f"fill must be a number, got {fill!r}.") from None
     is_whole = stored.dtype.kind != "f"
-    if is_whole and not np.array_equal(stored.astype(object), wanted.astype(object)):
+    is_exact = np.array_equal(stored.astype(object), wanted.astype(object))
+    if is_whole and not is_exact:
         raise UserError(f"fill must be a number of the type {dtype}, got {fill!r}.")
     return torch.from_numpy(np.array(stored)).to(dtype)
 
@@ -367,12 +400,15 @@ def _mean(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
     if table.dtype in (torch.int64, torch.uint64):
         return _mean_of_64_bits(table, rows, weights)
     is_whole = not table.is_floating_point()
-    numbers = table.double() if is_whole else table
+    numbers = table
+    if is_whole:
+        numbers = table.double()
     weights = weights.to(torch.promote_types(numbers.dtype, torch.float32))
     weights = _for_values(weights, table)
     total = numbers[rows[:, 0]] * weights[:, 0]
     for neighbour in range(1, rows.shape[1]):
-        total = total + numbers[rows[:, neighbour]] * weights[:, neighbour]
+        values = numbers[rows[:, neighbour]]
+        total = total + values * weights[:, neighbour]
     if is_whole:
         total = total.round()
     return total.to(table.dtype)
@@ -380,7 +416,8 @@ def _mean(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
 
 def _for_values(weights: Tensor, table: Tensor) -> Tensor:
     """Return weights ``(T, k)`` with as many dimensions as the values of ``(T, k)`` rows have."""
-    return weights.reshape(*weights.shape, *[1] * (table.ndim - 1))
+    dimensions = [1] * (table.ndim - 1)
+    return weights.reshape(*weights.shape, *dimensions)
 
 
 def _mean_of_64_bits(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
@@ -396,31 +433,40 @@ def _mean_of_64_bits(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
     low = (bits & 0xFFFFFFFF).double()
     heaviest = weights.argmax(1, keepdim=True)
     base = rows.gather(1, heaviest)[:, 0]
-    weights = weights.double() / weights.double().sum(1, keepdim=True)
+    weights = weights.double()
+    weights = weights / weights.sum(1, keepdim=True)
     weights = _for_values(weights, table)
-    difference = torch.zeros_like(high[base])
+    base_high = high[base]
+    base_low = low[base]
+    difference = torch.zeros_like(base_high)
     for neighbour in range(rows.shape[1]):
         row = rows[:, neighbour]
-        away = (high[row] - high[base]) * HALF + (low[row] - low[base])
+        high_away = (high[row] - base_high) * HALF
+        low_away = low[row] - base_low
+        away = high_away + low_away
         difference = difference + away * weights[:, neighbour]
     difference = difference.round()
     upper = (difference / HALF).floor()
     lower = difference - upper * HALF
-    mean = bits[base] + (upper.long() << 32) + lower.long()
+    upper_bits = upper.long() << 32
+    mean = bits[base] + upper_bits + lower.long()
     return mean.view(table.dtype)
 
 
 def _vote(table: Tensor, rows: Tensor, weights: Tensor) -> Tensor:
     """Return, column by column, the value with the largest sum of weights; of equals the nearer."""
     bits = _signed(table)
-    codes = bits.long().reshape(len(table), -1)[rows]  # (T, k, columns)
+    codes_of_rows = bits.long().reshape(len(table), -1)
+    codes = codes_of_rows[rows]  # (T, k, columns)
     votes = []
     for neighbour in range(rows.shape[1]):
         is_same = codes == codes[:, neighbour, None]
-        votes.append((is_same * weights[..., None]).sum(1))
+        weight_of_same = is_same * weights[..., None]
+        votes.append(weight_of_same.sum(1))
     winner = torch.stack(votes, 1).argmax(1, keepdim=True)
-    chosen = codes.gather(1, winner).to(bits.dtype)
-    return chosen.reshape(-1, *table.shape[1:]).view(table.dtype)
+    winning_codes = codes.gather(1, winner).to(bits.dtype)
+    values = winning_codes.reshape(-1, *table.shape[1:])
+    return values.view(table.dtype)
 
 
 def read_map(path: Path) -> PropagationMap:
@@ -433,12 +479,14 @@ def read_map(path: Path) -> PropagationMap:
         raise UserError(f"map: no file {path}. Write it by downsample --map {path}.")
     arrays = load_npz(path)
     if not _is_map(arrays):
+        names = ", ".join(arrays) or "no arrays"
         raise UserError(
             f"{path} is no map: it must hold whole numbers, rows (N, k) and m of at least 1, got "
-            f"{', '.join(arrays) or 'no arrays'}. Write it by downsample --map."
+            f"{names}. Write it by downsample --map."
         )
     rows = arrays["rows"]
-    weights = arrays.get("weights", np.ones((len(rows), 1), np.float32))  # may lack for k = 1
+    equal_weights = np.ones((len(rows), 1), np.float32)
+    weights = arrays.get("weights", equal_weights)  # may lack for k = 1
     if not _are_weights(weights, rows.shape):
         raise UserError(f"{path}: weights must be finite, at least 0, and of shape {rows.shape}.")
     if weights.dtype.kind != "f":
@@ -457,10 +505,12 @@ def _is_map(arrays: Mapping[str, NDArray[Any]]) -> bool:
     m = arrays["m"]
     if rows.dtype.kind not in "iu" or m.dtype.kind not in "iu":
         return False
-    return rows.ndim == 2 and rows.shape[1] > 0 and m.ndim == 0 and bool(m >= 1)
+    has_rows = rows.ndim == 2 and rows.shape[1] > 0
+    return has_rows and m.ndim == 0 and bool(m >= 1)
 
 
 def _are_weights(weights: NDArray[Any], shape: tuple[int, ...]) -> bool:
     if weights.dtype.kind not in "fiu" or weights.shape != shape:
         return False
-    return bool(np.isfinite(weights).all() and (weights >= 0).all())
+    are_finite = np.isfinite(weights).all()
+    return bool(are_finite and (weights >= 0).all())

@@ -58,7 +58,9 @@ def match(generated: Tensor, points: Tensor) -> Tensor:
         >>> match(torch.tensor([[[0.9, 0, 0], [1.2, 0, 0]]]), points)
         tensor([[1, 1]])
     """
-    return nearest(coordinates(generated.detach()), coordinates(points.detach()))[1]
+    queries = coordinates(generated.detach())
+    _, rows = nearest(queries, coordinates(points.detach()))
+    return rows
 
 
 def unique_count(indices: Tensor) -> Tensor:
@@ -95,8 +97,9 @@ def complete(indices: Tensor, points: Tensor, weight: Tensor | None = None) -> T
         >>> complete(torch.tensor([[1, 1]]), points)
         tensor([[1, 2]])
     """
-    fits = indices.ndim == 2 and points.ndim == 3 and len(points) == len(indices)
-    if not fits or indices.dtype != torch.int64 or indices.shape[1] > points.shape[1]:
+    have_shape = indices.ndim == 2 and points.ndim == 3
+    fits = have_shape and len(points) == len(indices) and indices.shape[1] <= points.shape[1]
+    if not fits or indices.dtype != torch.int64:
         raise UserError(
             "indices must be int64 (B, M) and points (B, N, 3), with the same B and M ≤ N, got "
             f"{indices.dtype} {tuple(indices.shape)} and {tuple(points.shape)}."
@@ -104,12 +107,13 @@ def complete(indices: Tensor, points: Tensor, weight: Tensor | None = None) -> T
     first = _is_first(indices)
     # A stable sort moves first occurrences to the front and keeps their order.
     order = first.logical_not().byte().argsort(dim=1, stable=True)
-    return farthest_point_fill(coordinates(points), indices.gather(1, order), first.sum(1), weight)
+    firsts_in_front = indices.gather(1, order)
+    return farthest_point_fill(coordinates(points), firsts_in_front, first.sum(1), weight)
 
 
 def _is_first(indices: Tensor) -> Tensor:
     """Return a ``(B, M)`` mask of the first occurrence of every index."""
     value, order = indices.sort(dim=1, stable=True)
-    new = torch.ones_like(indices, dtype=torch.bool)
-    new[:, 1:] = value[:, 1:] != value[:, :-1]
-    return torch.empty_like(new).scatter_(1, order, new)
+    is_new = torch.ones_like(indices, dtype=torch.bool)
+    is_new[:, 1:] = value[:, 1:] != value[:, :-1]
+    return torch.empty_like(is_new).scatter_(1, order, is_new)

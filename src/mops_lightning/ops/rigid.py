@@ -31,8 +31,9 @@ class Motion(NamedTuple):
 
     def after(self, first: "Motion") -> "Motion":
         """Return the composition: ``first``, then this motion."""
-        moved = self.apply(first.translation[:, None])[:, 0]
-        return Motion(quaternion_multiply(self.quaternion, first.quaternion), moved)
+        rotation = quaternion_multiply(self.quaternion, first.quaternion)
+        moved = self.apply(first.translation[:, None])
+        return Motion(rotation, translation=moved[:, 0])
 
 
 def move(points: Tensor, motion: Motion, channels: PointChannels) -> Tensor:
@@ -46,9 +47,10 @@ def move(points: Tensor, motion: Motion, channels: PointChannels) -> Tensor:
 
 def identity_motion(points: Tensor) -> Motion:
     """Return the identity for every cloud of ``(B, N, 3)`` points."""
-    zero = torch.zeros_like(points[:, 0])
-    one = torch.ones_like(zero[:, :1])
-    return Motion(torch.cat([one, zero], 1), zero)
+    translation = torch.zeros_like(points[:, 0])
+    scalar = torch.ones_like(translation[:, :1])
+    quaternion = torch.cat([scalar, translation], 1)
+    return Motion(quaternion, translation)
 
 
 def quaternion_conjugate(quaternion: Tensor) -> Tensor:
@@ -61,15 +63,17 @@ def quaternion_multiply(left: Tensor, right: Tensor) -> Tensor:
     """Return the Hamilton product ``(..., 4)``: the rotation ``right``, then ``left``."""
     a, u = left.tensor_split((1,), -1)
     b, v = right.tensor_split((1,), -1)
-    scalar = a * b - (u * v).sum(-1, keepdim=True)
-    vector = a * v + b * u + torch.linalg.cross(u, v)
+    inner = (u * v).sum(-1, keepdim=True)
+    cross = torch.linalg.cross(u, v)
+    scalar = a * b - inner
+    vector = a * v + b * u + cross
     return torch.cat([scalar, vector], -1)
 
 
 def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
     """Convert ``(..., 4)`` unit quaternions to ``(..., 3, 3)`` rotation matrices."""
     w, x, y, z = quaternion.unbind(-1)
-    rows = [
+    entries = [
         1 - 2 * (y * y + z * z),
         2 * (x * y - w * z),
         2 * (x * z + w * y),
@@ -80,7 +84,8 @@ def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
         2 * (y * z + w * x),
         1 - 2 * (x * x + y * y),
     ]
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+    rows = torch.stack(entries, -1)
+    return rows.unflatten(-1, (3, 3))
 
 
 def quaternion_from_euler(angles: Tensor) -> Tensor:
@@ -88,13 +93,15 @@ def quaternion_from_euler(angles: Tensor) -> Tensor:
     about_x = _about_axis(angles, 0)
     about_y = _about_axis(angles, 1)
     about_z = _about_axis(angles, 2)
-    return quaternion_multiply(about_z, quaternion_multiply(about_y, about_x))
+    about_y_and_x = quaternion_multiply(about_y, about_x)
+    return quaternion_multiply(about_z, about_y_and_x)
 
 
 def _about_axis(angles: Tensor, axis: int) -> Tensor:
     """Return the quaternions ``(..., 4)`` of one of ``(..., 3)`` angles."""
     half = angles[..., axis] / 2
-    quaternion = torch.zeros(*half.shape, 4, dtype=angles.dtype, device=angles.device)
+    shape = (*half.shape, 4)
+    quaternion = torch.zeros(shape, dtype=angles.dtype, device=angles.device)
     quaternion[..., 0] = half.cos()
     quaternion[..., 1 + axis] = half.sin()
     return quaternion
@@ -109,8 +116,10 @@ def motion_of_vectors(turn: Tensor, shift: Tensor) -> Motion:
     """
     angle = torch.linalg.vector_norm(turn, dim=1, keepdim=True)
     # sin(θ/2)/θ, by torch's sinc, which is sin(πx)/(πx) and 1 at 0
-    vector = turn * torch.sinc(angle / (2 * torch.pi)) / 2
-    return Motion(torch.cat([(angle / 2).cos(), vector], 1), shift)
+    sinc = torch.sinc(angle / (2 * torch.pi))
+    vector = turn * sinc / 2
+    scalar = (angle / 2).cos()
+    return Motion(torch.cat([scalar, vector], 1), shift)
 
 
 def rotation_angle(first: Tensor, second: Tensor) -> Tensor:
@@ -128,7 +137,8 @@ def rotation_angle(first: Tensor, second: Tensor) -> Tensor:
     """
     between = quaternion_multiply(quaternion_conjugate(first), second)
     scalar = between[..., 0]
-    length = torch.linalg.vector_norm(between[..., 1:], dim=-1)
+    vector = between[..., 1:]
+    length = torch.linalg.vector_norm(vector, dim=-1)
     return 2 * torch.atan2(length, scalar.abs())
 
 
@@ -143,8 +153,13 @@ def random_motion(rotation: float, translation: float, generators: Sequence[Gene
     Returns:
         B motions in float32.
     """
-    numbers = [torch.rand(2, 3, generator=rng, dtype=torch.float64) for rng in generators]
+    numbers = [_six_numbers(generator) for generator in generators]
     drawn = 2 * torch.stack(numbers) - 1
     angles = torch.deg2rad(drawn[:, 0] * rotation)
     shifts = drawn[:, 1] * translation
     return Motion(quaternion_from_euler(angles).float(), shifts.float())
+
+
+def _six_numbers(generator: Generator) -> Tensor:
+    """Return numbers from 0 to 1, of shape (2, 3)."""
+    return torch.rand(2, 3, generator=generator, dtype=torch.float64)

@@ -74,7 +74,8 @@ class SamplingMatrix(NamedTuple):
             ``(B, M, 3)``; differentiable in queries, keys and points. Above ``Blocks.dense``
             entries, S is computed block by block, and again in the backward pass.
         """
-        entries = self.keys.shape[0] * self.keys.shape[1] * self.m
+        clouds, points_in_cloud, _ = self.keys.shape
+        entries = clouds * points_in_cloud * self.m
         if entries <= blocks_on(self.keys.device).dense:
             return self.sample_dense(points)
         return streamed_attention(self.queries / self.tau, self.keys, points)
@@ -96,20 +97,25 @@ class SamplingMatrix(NamedTuple):
         """
         with torch.no_grad(), full_precision(self.keys.device.type):
             columns = self._columns()
-            kept = (columns >= threshold).scatter_(2, columns.argmax(2, keepdim=True), True)
-            values = columns.where(kept, 0.0)
-            return (values / values.sum(2, keepdim=True)).mT.to_sparse()
+            is_kept = columns >= threshold
+            is_kept = is_kept.scatter_(2, columns.argmax(2, keepdim=True), True)
+            values = columns.where(is_kept, 0.0)
+            normalised = values / values.sum(2, keepdim=True)
+            return normalised.mT.to_sparse()
 
     def leftmost(self, m: int) -> "SamplingMatrix":
         """Return the matrix of the first ``m`` columns, as FMOPS-Net takes them.
 
         Paper section "Flexible MOPS-Net for Arbitrary Ratios".
         """
-        return self._replace(queries=self.queries[..., :m, :])
+        queries = self.queries[..., :m, :]
+        return self._replace(queries=queries)
 
     def first_cloud(self) -> "SamplingMatrix":
         """Return the matrix of the first cloud, as a batch of one."""
-        queries = self.queries if self.queries.ndim == 2 else self.queries[:1]
+        queries = self.queries
+        if queries.ndim == 3:
+            queries = queries[:1]
         return self._replace(queries=queries, keys=self.keys[:1])
 
     def nonzero_counts(self, threshold: float = 0.01) -> Tensor:
@@ -119,9 +125,11 @@ class SamplingMatrix(NamedTuple):
             ``(B, M)`` in the dtype of the keys; without gradients.
         """
         with torch.no_grad():
-            counts = self.keys.new_zeros(self.keys.shape[0], self.m)
+            clouds = self.keys.shape[0]
+            counts = self.keys.new_zeros(clouds, self.m)
             for cloud, _, columns, block in self._blocks():
-                counts[cloud, columns] += (block >= threshold).sum(1)
+                is_large = block >= threshold
+                counts[cloud, columns] += is_large.sum(1)
             return counts
 
     def gram(self) -> Tensor:
@@ -132,28 +140,33 @@ class SamplingMatrix(NamedTuple):
         """
         m = self.m
         with torch.no_grad(), full_precision(self.keys.device.type):
-            result = self.keys.new_zeros(self.keys.shape[0], m, m)
+            clouds = self.keys.shape[0]
+            result = self.keys.new_zeros(clouds, m, m)
             for cloud, _, _, block in self._blocks(block_queries=m):
                 # SᵀS is symmetric: the part left of the diagonal is not computed.
                 for part in slices(m, GRAM_ROWS):
-                    result[cloud, part, part.start :] += block[part] @ block[part.start :].mT
+                    from_diagonal = block[part.start :]
+                    result[cloud, part, part.start :] += block[part] @ from_diagonal.mT
             return result.triu() + result.triu(1).mT
 
     def _columns(self) -> Tensor:
         """Return Sᵀ as ``(B, M, N)``: points last, so that the softmax runs along memory."""
-        return ((self.queries / self.tau) @ self.keys.mT).softmax(-1)
+        logits = (self.queries / self.tau) @ self.keys.mT
+        return logits.softmax(-1)
 
     def _blocks(
         self, block_queries: int | None = None
     ) -> Iterator[tuple[int, slice, slice, Tensor]]:
         """Yield (cloud, rows, columns, block of Sᵀ) over all of S."""
         queries = self.queries / self.tau
-        no_values = self.keys.new_zeros(*self.keys.shape[:2], 0)
+        clouds, points_in_cloud, _ = self.keys.shape
+        no_values = self.keys.new_zeros(clouds, points_in_cloud, 0)
         _, log_sum = attend_batch(queries, self.keys, no_values)
         size = blocks_on(queries.device)
-        powers = per_cloud(queries * LOG2_E, len(self.keys))
+        powers = per_cloud(queries * LOG2_E, clouds)
         for cloud, (power, keys) in enumerate(zip(powers, self.keys, strict=True)):
             for columns in slices(self.m, block_queries or size.queries):
-                for rows in slices(len(keys), size.points):
-                    level = log_sum[cloud, columns]
-                    yield cloud, rows, columns, softmax_weights(power[columns], keys[rows], level)
+                level = log_sum[cloud, columns]
+                for rows in slices(points_in_cloud, size.points):
+                    weights = softmax_weights(power[columns], keys[rows], level)
+                    yield cloud, rows, columns, weights

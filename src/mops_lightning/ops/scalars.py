@@ -7,7 +7,9 @@ from typing import Any
 def python_number(value: Any) -> Any:
     """Return a NumPy or torch scalar as a Python number, and any other value as it is."""
     is_scalar = getattr(value, "shape", None) == ()
-    return value.item() if is_scalar else value
+    if is_scalar:
+        return value.item()
+    return value
 
 
 def is_whole_number(value: Any) -> bool:

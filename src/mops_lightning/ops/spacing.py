@@ -15,7 +15,8 @@ from mops_lightning.ops.voxels import group
 FINEST = 2.0**30
 """Most cells along an axis."""
 
-SMALLEST, LARGEST = 5e-324, float(np.finfo(np.float64).max)
+SMALLEST = 5e-324
+LARGEST = float(np.finfo(np.float64).max)
 """Range of squared spacings: equal points are always near, and finite ones can be."""
 
 
@@ -36,8 +37,10 @@ def keep_spaced(
     Returns:
         Rows of ``points``, ascending; of equal points the first row.
     """
-    order = priority_order(points, priorities(points, seed), weight)
-    return np.flatnonzero(_states(points, spacing, order) == KEPT)
+    hashes = priorities(points, seed)
+    order = priority_order(points, hashes, weight)
+    states = _states(points, spacing, order)
+    return np.flatnonzero(states == KEPT)
 
 
 def uncovered(
@@ -52,19 +55,22 @@ def uncovered(
     """
     if not len(points):
         return np.empty(0, np.int64)
-    low, high = points.min(0) - spacing, points.max(0) + spacing
-    near = kept[((kept >= low) & (kept <= high)).all(axis=1)]
+    low = points.min(0) - spacing
+    high = points.max(0) + spacing
+    is_near = ((kept >= low) & (kept <= high)).all(axis=1)
+    near = kept[is_near]
     both = np.concatenate([near, points])
     states = _states(both, spacing, np.arange(len(near)))
-    return np.flatnonzero(states[len(near) :] == UNSEEN)
+    states_of_points = states[len(near) :]
+    return np.flatnonzero(states_of_points == UNSEEN)
 
 
 def priorities(points: NDArray[np.float64], seed: int = 0) -> NDArray[np.uint64]:
     """Hash the coordinates ``(N, C)`` of every point; points with lower hashes come first."""
-    bits = (np.ascontiguousarray(points, np.float64) + 0.0).view(np.uint64)  # -0 becomes 0
-    hashes: NDArray[np.uint64] = cell_kernels.hashes_of(
-        bits.ravel(), points.shape[1], np.uint64(seed)
-    )
+    numbers = np.ascontiguousarray(points, np.float64) + 0.0  # -0 becomes 0
+    bits = numbers.view(np.uint64).ravel()
+    channels = points.shape[1]
+    hashes: NDArray[np.uint64] = cell_kernels.hashes_of(bits, channels, np.uint64(seed))
     return hashes
 
 
@@ -83,7 +89,8 @@ def priority_order(
     # One sort of numbers is faster than a sort of rows: the high bits of a hash, and the row.
     rows = np.arange(len(points), dtype=np.uint64)
     words = np.sort((hashes >> row_bits << row_bits) | rows)
-    order = (words & ((np.uint64(1) << row_bits) - np.uint64(1))).astype(np.int64)
+    row_mask = (np.uint64(1) << row_bits) - np.uint64(1)
+    order = (words & row_mask).astype(np.int64)
     flat = np.ascontiguousarray(points, np.float64).ravel()
     cell_kernels.sort_ties(order, hashes, row_bits, flat, points.shape[1])
     return order
@@ -96,16 +103,21 @@ def _states(
     if not len(points):
         return np.empty(0, np.uint8)
     missing_axes = max(3 - points.shape[1], 0)
-    padded = np.pad(np.asarray(points, np.float64), ((0, 0), (0, missing_axes)))
-    shifted = padded[:, :3] - padded[:, :3].min(0)
-    rounding = 8 * np.finfo(np.float64).eps * float(np.abs(padded).max())
-    side = max(spacing * (1 + 1e-6) + rounding, float(shifted.max()) / FINEST)
+    numbers = np.asarray(points, np.float64)
+    padded = np.pad(numbers, ((0, 0), (0, missing_axes)))
+    coordinates = padded[:, :3]
+    shifted = coordinates - coordinates.min(0)
+    largest = float(np.abs(padded).max())
+    rounding = 8 * np.finfo(np.float64).eps * largest
+    extent = float(shifted.max())
+    side = max(spacing * (1 + 1e-6) + rounding, extent / FINEST)
     grouped = group(shifted, side)
     cell_number = len(grouped.places) // 3
     channels = padded.shape[1]
     by_cell, places, starts = cell_kernels.sort_by_cell(
         padded.ravel(), channels, grouped.cell_of, cell_number
     )
+    limit = min(max(spacing * spacing, SMALLEST), LARGEST)
     states: NDArray[np.uint8] = cell_kernels.visit(
         by_cell,
         channels,
@@ -115,6 +127,6 @@ def _states(
         grouped.places,
         grouped.table,
         order,
-        min(max(spacing * spacing, SMALLEST), LARGEST),
+        limit,
     )
     return states

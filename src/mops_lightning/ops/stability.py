@@ -57,7 +57,8 @@ def stable_places(rows: NDArray[np.float64], m: int) -> NDArray[np.int64]:
     """
     covariance = np.einsum("ni,nj->ij", rows, rows)  # the same sum for any number of threads
     directions = np.linalg.eigh(covariance)[1]
-    squares = np.square(np.einsum("ni,ij->nj", rows, directions))
+    projections = np.einsum("ni,ij->nj", rows, directions)
+    squares = np.square(projections)
     orders = np.argsort(-squares.T, axis=1, kind="stable")
     places: NDArray[np.int64] = cover_least_held(squares, orders, m)
     return places
@@ -76,7 +77,8 @@ def informative_places(rows: NDArray[np.float64], m: int) -> NDArray[np.int64]:
     Returns:
         ``(m,)`` places, in the order of choice; of equal gains the lowest place.
     """
-    places: NDArray[np.int64] = grow_information(np.ascontiguousarray(rows), PRIOR, m)
+    contiguous_rows = np.ascontiguousarray(rows)
+    places: NDArray[np.int64] = grow_information(contiguous_rows, PRIOR, m)
     return places
 
 
@@ -98,9 +100,8 @@ def steady_places(
         ``(m,)`` places, in the order of choice; of equal traces the lowest place.
     """
     variances = np.square(spread / np.median(spread))
-    places: NDArray[np.int64] = grow_steady(
-        np.ascontiguousarray(rows), variances, ROTATION, RIDGE, m
-    )
+    contiguous_rows = np.ascontiguousarray(rows)
+    places: NDArray[np.int64] = grow_steady(contiguous_rows, variances, ROTATION, RIDGE, m)
     return places
 
 
@@ -123,7 +124,8 @@ def places_by_direction(normals: NDArray[np.float64], m: int) -> NDArray[np.int6
     by_bucket = np.argsort(bucket, kind="stable")
     counts = np.bincount(bucket)
     starts = np.cumsum(counts) - counts
-    places_in_bucket = np.arange(len(normals)) - starts[bucket[by_bucket]]
+    start_of_each = starts[bucket[by_bucket]]
+    places_in_bucket = np.arange(len(normals)) - start_of_each
     rounds = np.empty(len(normals), np.int64)
     rounds[by_bucket] = places_in_bucket
     return np.argsort(rounds, kind="stable")[:m]
@@ -131,11 +133,14 @@ def places_by_direction(normals: NDArray[np.float64], m: int) -> NDArray[np.int6
 
 def _buckets(normals: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the cell ``(N,)`` of every normal on the cube, 0 to 3·CELLS² − 1."""
-    face = np.abs(normals).argmax(1)[:, None]
+    largest_axis = np.abs(normals).argmax(1)
+    face = largest_axis[:, None]
     other_axes = (face + np.array([1, 2])) % 3
     along = np.take_along_axis(normals, face, 1)
     across = np.take_along_axis(normals, other_axes, 1)
-    angles = np.arctan(across / along) / (np.pi / 4)  # from -1 to 1
-    cells = ((angles + 1) / 2 * CELLS).astype(np.int64)
-    rows, columns = np.clip(cells, 0, CELLS - 1).T
-    return (face[:, 0] * CELLS + rows) * CELLS + columns
+    angles = np.arctan(across / along)
+    positions = angles / (np.pi / 4)  # from -1 to 1
+    cells = (positions + 1) / 2 * CELLS
+    cells = np.clip(cells.astype(np.int64), 0, CELLS - 1)
+    rows, columns = cells.T
+    return (largest_axis * CELLS + rows) * CELLS + columns

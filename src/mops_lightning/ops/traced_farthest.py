@@ -33,14 +33,18 @@ def farthest_from_mean(points: Tensor, m: int) -> Tensor:
     def choose(
         step: Tensor, last: Tensor, rows: Tensor, distances: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        place = last[:, None, None].expand(-1, 1, exact.shape[2])
-        lowered = torch.minimum(distances, _squares(exact, exact.gather(1, place)))
+        channels = exact.shape[2]
+        place = last[:, None, None].expand(-1, 1, channels)
+        point = exact.gather(1, place)
+        lowered = torch.minimum(distances, _squares(exact, point))
         lowered = lowered.scatter(1, last[:, None], -1.0)
         largest, row = lowered.max(1)
         chosen = torch.where(largest < 0, number, row)
-        return step + 1, chosen, torch.where(columns == step, chosen[:, None], rows), lowered
+        new_rows = torch.where(columns == step, chosen[:, None], rows)
+        return step + 1, chosen, new_rows, lowered
 
-    chosen_rows: Tensor = while_loop(continues, choose, (step, first, rows, distances))[2]
+    state = (step, first, rows, distances)
+    chosen_rows: Tensor = while_loop(continues, choose, state)[2]
     return chosen_rows
 
 

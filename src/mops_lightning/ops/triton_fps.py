@@ -11,7 +11,8 @@ from mops_lightning.ops.points import gather_points, to_planes
 LARGEST = 16384
 """Most points of a cloud: a block keeps them all in its registers."""
 
-POINTS_PER_WARP, MOST_WARPS = 256, 32
+POINTS_PER_WARP = 256
+MOST_WARPS = 32
 
 SHARE = 1 - 12 * torch.finfo(torch.float32).eps
 """Share of the largest distance from which a point could be the farthest: twice the largest

@@ -20,7 +20,9 @@ TOLERANCE = 1 + 1e-6
 @jit
 def _key(x, y, z, scale):
     """Return the voxel of a position in the unit cube, in ascending (x, y, z) order."""
-    return (np.int64(x * scale) << 42) + (np.int64(y * scale) << 21) + np.int64(z * scale)
+    x_part = np.int64(x * scale) << 42
+    y_part = np.int64(y * scale) << 21
+    return x_part + y_part + np.int64(z * scale)
 
 
 @jit_cached
@@ -35,13 +37,15 @@ def in_unit_cube(points, tiny):
     high = points[:3].copy()
     for i in range(len(points) // 3):
         for axis in range(3):
-            low[axis] = min(low[axis], points[3 * i + axis])
-            high[axis] = max(high[axis], points[3 * i + axis])
+            coordinate = points[3 * i + axis]
+            low[axis] = min(low[axis], coordinate)
+            high[axis] = max(high[axis], coordinate)
     side = max(high[0] - low[0], high[1] - low[1], high[2] - low[2], tiny)
     spans = np.empty_like(points)
     for i in range(len(points) // 3):
         for axis in range(3):
-            spans[3 * i + axis] = (points[3 * i + axis] - low[axis]) / side
+            offset = points[3 * i + axis] - low[axis]
+            spans[3 * i + axis] = offset / side
     return spans
 
 
@@ -73,7 +77,10 @@ def reaches(spans, scale, wanted, table, shift):
     known = 0
     last = -1
     for i in range(len(spans) // 3):
-        key = _key(spans[3 * i], spans[3 * i + 1], spans[3 * i + 2], scale)
+        x = spans[3 * i]
+        y = spans[3 * i + 1]
+        z = spans[3 * i + 2]
+        key = _key(x, y, z, scale)
         if key == last:
             continue
         last = key
@@ -110,7 +117,9 @@ def settle(spans, coarse, fine, table, shift):
     entered = 0
     last = -1
     for i in range(len(spans) // 3):
-        x, y, z = spans[3 * i], spans[3 * i + 1], spans[3 * i + 2]
+        x = spans[3 * i]
+        y = spans[3 * i + 1]
+        z = spans[3 * i + 2]
         key = _key(x, y, z, coarse)
         if key != _key(x, y, z, fine):
             others[left] = x
@@ -128,7 +137,8 @@ def settle(spans, coarse, fine, table, shift):
 def group(spans, scale):
     """Return the voxel ``(N,)`` of every point, numbered as they are met, and their keys."""
     number = len(spans) // 3
-    size, shift = 1024, 54
+    size = 1024
+    shift = 54
     while size < 2 * number:
         size *= 2
         shift -= 1
@@ -137,7 +147,10 @@ def group(spans, scale):
     keys = np.empty(number, np.int64)
     known = 0
     for i in range(number):
-        key = _key(spans[3 * i], spans[3 * i + 1], spans[3 * i + 2], scale)
+        x = spans[3 * i]
+        y = spans[3 * i + 1]
+        z = spans[3 * i + 2]
+        key = _key(x, y, z, scale)
         slot = ((key * MIX) >> shift) & (size - 1)
         while table[slot] >= 0 and keys[table[slot]] != key:
             slot = (slot + 1) & (size - 1)
@@ -152,7 +165,8 @@ def group(spans, scale):
 @jit
 def _steps(points, low, i, axis, unit):
     """Return a coordinate as a whole number, so that sums do not depend on the order."""
-    return np.int64((points[3 * i + axis] - low[axis]) * unit)
+    offset = points[3 * i + axis] - low[axis]
+    return np.int64(offset * unit)
 
 
 @jit_cached
@@ -170,8 +184,9 @@ def nearest_to_means(points, cell_of, known, hashes, bits):
     high = np.full(3, -np.inf)
     for i in range(len(cell_of)):
         for axis in range(3):
-            low[axis] = min(low[axis], points[3 * i + axis])
-            high[axis] = max(high[axis], points[3 * i + axis])
+            coordinate = points[3 * i + axis]
+            low[axis] = min(low[axis], coordinate)
+            high[axis] = max(high[axis], coordinate)
     side = max(high[0] - low[0], high[1] - low[1], high[2] - low[2])
     unit = 2.0**bits / side if side > 0 else 1.0
     counts = np.zeros(known, np.int64)
@@ -196,8 +211,8 @@ def nearest_to_means(points, cell_of, known, hashes, bits):
     rows = np.full(known, -1, np.int64)
     for i in range(len(cell_of)):
         cell = cell_of[i]
-        if squared[i] <= smallest[cell] * TOLERANCE and (
-            rows[cell] < 0 or hashes[i] < hashes[rows[cell]]
-        ):
+        is_nearest = squared[i] <= smallest[cell] * TOLERANCE
+        row = rows[cell]
+        if is_nearest and (row < 0 or hashes[i] < hashes[row]):
             rows[cell] = i
     return counts, rows

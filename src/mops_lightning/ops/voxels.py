@@ -50,7 +50,8 @@ class Voxels(NamedTuple):
 
     def rows_of(self, places: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the row of every one of the ``(k, 3)`` places, all of which are occupied."""
-        order, starts = runs(np.concatenate([self.places, places]))
+        places_of_both = np.concatenate([self.places, places])
+        order, starts = runs(places_of_both)
         group = np.zeros(len(order), np.int64)
         group[starts[1:]] = 1
         rows = np.empty(len(order), np.int64)
@@ -59,7 +60,8 @@ class Voxels(NamedTuple):
 
     def means(self, size: float) -> NDArray[np.float64]:
         """Return the means ``(K, 3)`` of the points of every voxel."""
-        inside = self.sums / self.counts[:, None] / cell_kernels.STEPS
+        mean_steps = self.sums / self.counts[:, None]
+        inside = mean_steps / cell_kernels.STEPS
         centres: NDArray[np.float64] = (self.places + inside) * size
         return centres
 
@@ -73,7 +75,8 @@ def runs(places: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64
     order = np.lexsort(places.T[::-1])
     ordered = places[order]
     is_new = np.ones(len(order), bool)
-    is_new[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
+    differs = ordered[1:] != ordered[:-1]
+    is_new[1:] = differs.any(axis=1)
     return order, np.flatnonzero(is_new)
 
 
@@ -106,7 +109,8 @@ def group(points: NDArray[np.float64], size: float) -> Grouped:
         raise UserError(
             f"voxel: {size:g} is too small for coordinates of up to {largest:g}. Use larger voxels."
         )
-    return Grouped(*cell_kernels.group(points.ravel(), float(size)))
+    cells = cell_kernels.group(points.ravel(), float(size))
+    return Grouped(*cells)
 
 
 def occupied(points: NDArray[np.float64], size: float) -> Voxels:
@@ -124,7 +128,8 @@ def _sums(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the ``(K,)`` counts and ``(K, 3)`` sums of ``Voxels``, in the order of the groups."""
     number = len(grouped.places) // 3
-    counts, sums = cell_kernels.add_up(points.ravel(), float(size), grouped.cell_of, number)
+    flat = points.ravel()
+    counts, sums = cell_kernels.add_up(flat, float(size), grouped.cell_of, number)
     _check_counts(counts)
     return counts, sums.reshape(-1, 3)
 
@@ -176,7 +181,8 @@ def representatives(
         counts = voxels.counts
         sums = voxels.sums
         voxel_of_cell = voxels.rows_of(grouped.places.reshape(-1, 3))
-    means = (sums / counts[:, None])[voxel_of_cell]
+    means_of_voxels = sums / counts[:, None]
+    means = means_of_voxels[voxel_of_cell]
     heaviness = np.empty(0)
     if weight is not None:
         heaviness = np.ascontiguousarray(weight, np.float64)
@@ -205,22 +211,23 @@ class Sums(NamedTuple):
     def means(self, counts: NDArray[np.int64], scales: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the means ``(K, A)``; NaN where a value is not finite."""
         total = self.high + self.low / cell_kernels.STEPS
-        means: NDArray[np.float64] = np.where(
-            self.wrong > 0, np.nan, total / counts[:, None] / scales
-        )
+        means: NDArray[np.float64] = total / counts[:, None] / scales
+        means[self.wrong > 0] = np.nan
         return means
 
 
 def column_scales(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return powers of two ``(A,)`` that bring the numbers of columns ``(N, A)`` below 2³⁶."""
-    largest = np.abs(np.where(np.isfinite(values), values, 0.0)).max(axis=0, initial=0.0)
+    finite = np.where(np.isfinite(values), values, 0.0)
+    largest = np.abs(finite).max(axis=0, initial=0.0)
     return scales_for(largest)
 
 
 def scales_for(largest: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return ``column_scales`` for the largest absolute values ``(A,)`` of columns."""
     exponent = np.frexp(largest)[1]
-    scales: NDArray[np.float64] = np.ldexp(1.0, np.clip(36 - exponent, -1000, 1000))
+    power = np.clip(36 - exponent, -1000, 1000)
+    scales: NDArray[np.float64] = np.ldexp(1.0, power)
     return scales
 
 
@@ -241,15 +248,22 @@ def sum_columns(
         scales: ``(A,)`` from ``column_scales`` of the whole cloud.
     """
     grouped = group(np.ascontiguousarray(points, np.float64), size)
-    voxel = voxels.rows_of(grouped.places.reshape(-1, 3))[grouped.cell_of]
+    voxel_of_cell = voxels.rows_of(grouped.places.reshape(-1, 3))
+    voxel = voxel_of_cell[grouped.cell_of]
     wrong = ~np.isfinite(values)
     scaled = np.where(wrong, 0.0, values) * scales
     high = np.trunc(scaled)
     low = np.rint((scaled - high) * cell_kernels.STEPS)
-    sums = [np.zeros((len(voxels.counts), values.shape[1]), np.int64) for _ in range(3)]
-    for total, part in zip(sums, (high, low, wrong), strict=True):
-        np.add.at(total, voxel, part.astype(np.int64))
-    return Sums(*sums)
+    shape = (len(voxels.counts), values.shape[1])
+    sums = Sums(
+        high=np.zeros(shape, np.int64),
+        low=np.zeros(shape, np.int64),
+        wrong=np.zeros(shape, np.int64),
+    )
+    np.add.at(sums.high, voxel, high.astype(np.int64))
+    np.add.at(sums.low, voxel, low.astype(np.int64))
+    np.add.at(sums.wrong, voxel, wrong.astype(np.int64))
+    return sums
 
 
 def voxel_means(points: NDArray[np.float64], size: float) -> NDArray[np.float64]:

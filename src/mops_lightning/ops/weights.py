@@ -14,7 +14,8 @@ from mops_lightning.ops.points import as_tensor
 CURVATURE = "curvature"
 """The word that asks for ``curvature`` in place of weights."""
 
-NEIGHBOURS, LEAST = 16, 0.001
+NEIGHBOURS = 16
+LEAST = 0.001
 """Nearest points of a plane fit, and the weight of a flat neighbourhood."""
 
 PART = 2**16
@@ -33,19 +34,19 @@ def check_weight(weight: Any, shape: tuple[int, ...], name: str = "weight") -> T
         UserError: the shape or a value is wrong.
     """
     tensor = as_tensor(name, weight).detach()
-    if tuple(tensor.shape) != shape or tensor.is_complex():
+    given = tuple(tensor.shape)
+    if given != shape or tensor.is_complex():
         raise UserError(
             f"{name} must be one number per point, shape {shape}, got {tensor.dtype} of shape "
-            f"{tuple(tensor.shape)}."
+            f"{given}."
         )
     tensor = tensor.double()
     wrong = ~(torch.isfinite(tensor) & (tensor >= 0))
     if bool(wrong.any()):
         row = wrong.nonzero()[0]
-        raise UserError(
-            f"{name} must be finite and at least 0, got {float(tensor[tuple(row)])} in row "
-            f"{', '.join(map(str, row.tolist()))}."
-        )
+        number = float(tensor[tuple(row)])
+        row_text = ", ".join(map(str, row.tolist()))
+        raise UserError(f"{name} must be finite and at least 0, got {number} in row {row_text}.")
     return tensor
 
 
@@ -68,14 +69,18 @@ def curvature(points: NDArray[Any]) -> NDArray[np.float64]:
     if not np.isfinite(points).all():
         raise UserError("points must be finite, got NaN or infinity.")
     tree = cKDTree(points)
+    neighbours = min(NEIGHBOURS, len(points))
     result = np.full(len(points), LEAST)
     for start in range(0, len(points), PART):
         part = points[start : start + PART]
-        rows = np.asarray(tree.query(part, k=min(NEIGHBOURS, len(points)))[1])
-        near = np.asarray(points, np.float64)[rows.reshape(len(part), -1)]
+        rows = np.asarray(tree.query(part, k=neighbours)[1])
+        rows = rows.reshape(len(part), -1)
+        near = np.asarray(points, np.float64)[rows]
         offsets = near - near.mean(1, keepdims=True)
-        values = np.linalg.eigvalsh(offsets.transpose(0, 2, 1) @ offsets)
+        covariances = offsets.transpose(0, 2, 1) @ offsets
+        values = np.linalg.eigvalsh(covariances)
         total = values.sum(1)
-        share = np.divide(values[:, 0], total, out=np.zeros(len(part)), where=total > 0)
+        zeros = np.zeros(len(part))
+        share = np.divide(values[:, 0], total, out=zeros, where=total > 0)
         result[start : start + PART] = np.maximum(share, LEAST)
     return result

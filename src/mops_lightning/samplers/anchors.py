@@ -47,7 +47,8 @@ class FPSAnchors(nn.Module):
         self.relation = nn.Parameter(torch.zeros(channels, channels))
         # On a surface the spacing of k points decreases as √(1/k).
         first = width * math.sqrt(SPACING_POINTS / m)
-        self.log_width = nn.Parameter(torch.full((m,), math.log(first)))
+        log_width = torch.full((m,), math.log(first))
+        self.log_width = nn.Parameter(log_width)
 
     @property
     def weight(self) -> Tensor:
@@ -71,20 +72,26 @@ class FPSAnchors(nn.Module):
             Matrices with queries ``(B, m, C + 4)``, in float32 at least.
         """
         dtype = distance_dtype(points)
-        places, keys = points.to(dtype), keys.to(dtype)
+        places = points.to(dtype)
+        keys = keys.to(dtype)
         # Distances are more precise around the mean.
         centred = places - places.mean(1, keepdim=True)
         rows = rows_from_mean(places, m)
-        unit = squared_spacing(gather_points(centred, rows[:, :SPACING_POINTS]))
+        first_places = gather_points(centred, rows[:, :SPACING_POINTS])
+        unit = squared_spacing(first_places)
         rows = rows[:, :m]
         anchors = gather_points(centred, rows)
-        width = unit[:, None] * self.log_width[:m].to(dtype).mul(2).exp()
+        log_width = self.log_width[:m].to(dtype)
+        width = unit[:, None] * log_width.mul(2).exp()
         sharpness = width.clamp_min(SMALLEST**2).reciprocal()[..., None]
-        related = gather_points(keys, rows) @ self.relation.to(dtype).mT
-        content = self.slots[:m].to(dtype) + related / math.sqrt(keys.shape[2])
+        keys_of_anchors = gather_points(keys, rows)
+        related = keys_of_anchors @ self.relation.to(dtype).mT
+        slots = self.slots[:m].to(dtype)
+        content = slots + related / math.sqrt(keys.shape[2])
         queries = torch.cat([content, 2 * sharpness * anchors, -sharpness], 2)
         squares = centred.square().sum(2, keepdim=True)
-        return SamplingMatrix(queries, torch.cat([keys, centred, squares], 2), tau)
+        keys_with_places = torch.cat([keys, centred, squares], 2)
+        return SamplingMatrix(queries, keys_with_places, tau)
 
 
 def rows_from_mean(places: Tensor, number: int) -> Tensor:
@@ -101,7 +108,8 @@ def rows_from_mean(places: Tensor, number: int) -> Tensor:
     wanted = max(number, SPACING_POINTS)
     if torch.compiler.is_exporting():
         return farthest_from_mean(places, wanted)
-    return farthest_rows(places, min(wanted, places.shape[1]), start=FARTHEST)
+    wanted = min(wanted, places.shape[1])
+    return farthest_rows(places, wanted, start=FARTHEST)
 
 
 def squared_spacing(farthest: Tensor) -> Tensor:
@@ -116,5 +124,6 @@ def squared_spacing(farthest: Tensor) -> Tensor:
     count = farthest.shape[1]
     if count < 2:
         return farthest.new_ones(len(farthest))
-    apart = (farthest[:, :-1] - farthest[:, -1:]).square().sum(2).amin(1)
-    return apart * (count / SPACING_POINTS)
+    to_last = farthest[:, :-1] - farthest[:, -1:]
+    spacing = to_last.square().sum(2).amin(1)
+    return spacing * (count / SPACING_POINTS)

@@ -89,7 +89,8 @@ class Sampler(nn.Module):
 
     def __init__(self, m: int) -> None:
         super().__init__()
-        if isinstance(m, bool) or not isinstance(m, int) or m < 1:
+        is_whole = isinstance(m, int) and not isinstance(m, bool)
+        if not is_whole or m < 1:
             raise UserError(f"m must be a whole number of at least 1, got {m!r}.")
         self.m = m
         self.point_channels = PointChannels.of(0)
@@ -108,7 +109,8 @@ class Sampler(nn.Module):
         Raises:
             UserError: ``points`` or ``m`` is invalid.
         """
-        m = self.m if m is None else m
+        if m is None:
+            m = self.m
         return self.sample_sizes(points, (m,))[m]
 
     @torch.no_grad()
@@ -153,10 +155,12 @@ class Sampler(nn.Module):
             >>> points.shape, indices.shape
             (torch.Size([8, 3]), torch.Size([8]))
         """
-        m = self.m if m is None else m
+        if m is None:
+            m = self.m
         self.check_m(m)
         if readout not in READOUTS:
-            raise UserError(f"readout: unknown {readout!r}.{did_you_mean(str(readout), READOUTS)}")
+            hint = did_you_mean(str(readout), READOUTS)
+            raise UserError(f"readout: unknown {readout!r}.{hint}")
         if self.learned and self.training:
             raise UserError("downsample needs a sampler in eval mode: call eval() first.")
         if weight is not None:
@@ -165,12 +169,17 @@ class Sampler(nn.Module):
         select: Select = partial(self.select, readout)
         if not self.any_unit:
             select = partial(select_in_unit_sphere, select, self.point_channels)
-        method = Method(select, self.point_channels, self.channels_of_input is None)
+        any_channels = self.channels_of_input is None
+        method = Method(select, self.point_channels, any_channels)
         return select_points(method, points, m, batch, weight)
 
     @torch.no_grad()
     def select(
-        self, readout: str, clouds: Tensor, m: int, weight: Tensor | None = None
+        self,
+        readout: str,
+        clouds: Tensor,
+        m: int,
+        weight: Tensor | None = None,
     ) -> tuple[Tensor, Tensor | None]:
         """Sample clouds ``(B, N, 3)``; see ``downsample``.
 
@@ -188,24 +197,32 @@ class Sampler(nn.Module):
             return gather_points(clouds, rows), rows
         given = clouds.to(next(self.parameters(), clouds))  # dtype and device
         if self.streams and given.shape[1] > PART:  # features of all points take more memory
-            generated = torch.stack([stream_sample(self, partial(iter, [x]), m) for x in given])
+            generated = torch.stack([self._streamed(cloud, m) for cloud in given])
         else:
             generated, indices, *_ = self(given, m)
             if not self.generates:
                 return generated, indices
         return select(clouds, generated.to(clouds.device), readout, weight)
 
+    def _streamed(self, cloud: Tensor, m: int) -> Tensor:
+        chunks = partial(iter, [cloud])
+        return stream_sample(self, chunks, m)
+
     def _checked(self, points: Tensor, m: int) -> SampleOutput:
         """Check the points and sample them, without losses."""
         # A graph cannot branch on values, and on a GPU the check waits for the device.
-        finite = not (torch.compiler.is_compiling() or (self.training and points.is_cuda))
+        waits_for_device = self.training and points.is_cuda
+        finite = not (torch.compiler.is_compiling() or waits_for_device)
         check_points(points, at_least=m, finite=finite, channels=self.channels_of_input)
-        dtype = next((p.dtype for p in self.parameters()), points.dtype)
+        dtype = next((weights.dtype for weights in self.parameters()), points.dtype)
         if not torch.is_autocast_enabled(points.device.type):
             check_dtype(points, dtype)
-        seen = points if self.point_channels else coordinates(points)
+        seen = points
+        if not self.point_channels:
+            seen = coordinates(points)
         with restrict_autocast_to_pointwise(points.device.type):
-            output = with_carried(self.sample(seen.to(dtype), m), points)
+            sampled = self.sample(seen.to(dtype), m)
+            output = with_carried(sampled, points)
         return output._replace(points=output.points.to(points.dtype))
 
     def sample_sizes(self, points: Tensor, sizes: Sequence[int]) -> dict[int, SampleOutput]:
@@ -226,8 +243,14 @@ class Sampler(nn.Module):
         for m in sizes:
             self.check_m(m)
         largest = self._checked(points, max(sizes))
-        losses = self.losses(points, largest, sizes) if self.training else {}
-        return {m: largest.first(m)._replace(losses=losses.get(m, {})) for m in sizes}
+        losses: dict[int, dict[str, Tensor]] = {}
+        if self.training:
+            losses = self.losses(points, largest, sizes)
+        outputs = {}
+        for m in sizes:
+            output = largest.first(m)
+            outputs[m] = output._replace(losses=losses.get(m, {}))
+        return outputs
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Sample checked input; arguments and result as in ``forward``."""
@@ -253,8 +276,10 @@ class Sampler(nn.Module):
         """
         if self.generates and readout != "completed":
             raise UserError(f"weight: the {readout} readout takes no weights. {WEIGHTED}")
-        if not self.generates and type(self).sample_weighted is Sampler.sample_weighted:
-            raise UserError(f"weight: {type(self).__name__} takes no weights. {WEIGHTED}")
+        takes_weights = type(self).sample_weighted is not Sampler.sample_weighted
+        if not self.generates and not takes_weights:
+            name = type(self).__name__
+            raise UserError(f"weight: {name} takes no weights. {WEIGHTED}")
 
     def losses(
         self, points: Tensor, output: SampleOutput, sizes: Sequence[int]
@@ -322,9 +347,8 @@ class Sampler(nn.Module):
         if self.flexible and not 1 <= m <= self.m:
             raise UserError(f"m must be between 1 and {self.m}, got {m}.")
         if not self.flexible and m != self.m:
-            raise UserError(
-                f"m must be {self.m}, the size this {type(self).__name__} was made for, got {m}."
-            )
+            name = type(self).__name__
+            raise UserError(f"m must be {self.m}, the size this {name} was made for, got {m}.")
 
 
 def stream_sample(sampler: Sampler, chunks: Chunks, m: int | None = None) -> Tensor:
@@ -346,13 +370,16 @@ def stream_sample(sampler: Sampler, chunks: Chunks, m: int | None = None) -> Ten
     Raises:
         UserError: the sampler needs whole clouds, ``m`` is out of range, or a chunk is invalid.
     """
-    m = sampler.m if m is None else m
+    if m is None:
+        m = sampler.m
     net = sampler.fused()
     sampler.check_m(m)
-    peaks = (net.global_part(chunk) for chunk in _checked_chunks(chunks, m, sampler))
+    checked = _checked_chunks(chunks, m, sampler)
+    peaks = (net.global_part(chunk) for chunk in checked)
     global_ = reduce(torch.maximum, peaks)
     sums = (net.sum_part(chunk, global_, m) for chunk in chunks())
-    return sampler.point_channels.renormalised(reduce(Partial.merge, sums).result())
+    total = reduce(Partial.merge, sums)
+    return sampler.point_channels.renormalised(total.result())
 
 
 def _checked_chunks(chunks: Chunks, m: int, sampler: Sampler) -> Iterable[Tensor]:

@@ -28,7 +28,9 @@ def as_size(m: Any) -> Size:
         return int(number)
     if is_number and not is_whole and 0 < number < 1:
         return float(number)
-    hint = " One point is m=1, all points need no sampling." if number == 1 else ""
+    hint = ""
+    if number == 1:
+        hint = " One point is m=1, all points need no sampling."
     raise UserError(
         "m must be a whole number of at least 1, or a share of the points above 0 and below 1, "
         f"such as 0.1, got {m!r:.99}.{hint}"
@@ -48,7 +50,8 @@ def check_distance(name: str, value: Any) -> float:
     Raises:
         UserError: it is none.
     """
-    is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    is_number = isinstance(value, int | float | np.number)
+    is_number = is_number and not isinstance(value, bool)
     if not is_number or not 0 < float(value) < inf:
         raise UserError(f"{name} must be a number above 0, in the unit of the points, got {value}.")
     return float(value)

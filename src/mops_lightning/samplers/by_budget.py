@@ -57,7 +57,8 @@ class ByBudget(Sampler):
         if not samplers or not isinstance(samplers[0], FPSSampler):
             raise UserError("samplers must begin with farthest point sampling.")
         is_ascending = list(budgets) == sorted(set(budgets))
-        if not budgets or len(budgets) != len(best) or not is_ascending or budgets[0] < 1:
+        are_pairs = len(budgets) == len(best)
+        if not budgets or not are_pairs or not is_ascending or budgets[0] < 1:
             raise UserError("budgets must be ascending numbers of points, each with its best.")
         if not all(0 <= place < len(samplers) for place in best):
             raise UserError("best must hold positions in samplers.")
@@ -68,8 +69,13 @@ class ByBudget(Sampler):
     def sampler_for(self, m: int) -> Sampler:
         """Return the sampler that chooses m points."""
         sampler = cast(Sampler, self.samplers[self._place(m)])
-        can = m <= sampler.m if sampler.flexible else m == sampler.m
-        return sampler if can else cast(Sampler, self.samplers[0])
+        if sampler.flexible:
+            can_sample = m <= sampler.m
+        else:
+            can_sample = m == sampler.m
+        if can_sample:
+            return sampler
+        return cast(Sampler, self.samplers[0])
 
     def _place(self, m: int) -> int:
         """Return the position of the best method for m points."""
@@ -77,7 +83,9 @@ class ByBudget(Sampler):
         if after == len(self.budgets):
             return 0
         is_compared = self.budgets[after] == m
-        if is_compared or not after or self.best[after - 1] == self.best[after]:
+        if is_compared or after == 0:
+            return self.best[after]
+        if self.best[after - 1] == self.best[after]:
             return self.best[after]
         return 0
 
@@ -85,7 +93,9 @@ class ByBudget(Sampler):
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Return m of the points ``(B, N, 3)`` with their indices."""
         sampler = self.sampler_for(m)
-        seen = points if sampler.point_channels else coordinates(points)
+        seen = points
+        if not sampler.point_channels:
+            seen = coordinates(points)
         rows = rows_in_unit_sphere(sampler, seen, m)
         return SampleOutput(gather_points(points, rows), rows, {})
 

@@ -53,13 +53,17 @@ class ByNormals(Sampler):
             normals: ``(B, N, 3)`` unit vectors; None: they are estimated.
         """
         order = seeded_order(points, self.seed)
-        ordered = gather_points(points.detach(), order).double().cpu().numpy()
+        ordered = gather_points(points.detach(), order)
+        clouds = ordered.double().cpu().numpy()
         if normals is None:
-            directions = [estimate_normals(cloud, self.neighbours) for cloud in ordered]
+            directions = [estimate_normals(cloud, self.neighbours) for cloud in clouds]
         else:
-            directions = list(gather_points(normals, order).double().cpu().numpy())
-        places = [self.choose(*pair, m) for pair in zip(ordered, directions, strict=True)]
-        return order.gather(1, torch.from_numpy(np.stack(places)).to(points.device))
+            ordered_normals = gather_points(normals, order)
+            directions = list(ordered_normals.double().cpu().numpy())
+        pairs = zip(clouds, directions, strict=True)
+        places = [self.choose(cloud, direction, m) for cloud, direction in pairs]
+        chosen = torch.from_numpy(np.stack(places)).to(points.device)
+        return order.gather(1, chosen)
 
     def choose(
         self, points: NDArray[np.float64], normals: NDArray[np.float64], m: int

@@ -25,6 +25,8 @@ def with_carried(output: SampleOutput, points: Tensor) -> SampleOutput:
         return output
     rows = output.indices
     if rows is None:
-        rows = nearest(sampled, coordinates(points).to(sampled.dtype))[1]
-    channels = gather_points(points[..., 3:], rows).to(sampled.dtype)
-    return output._replace(points=torch.cat([sampled, channels], -1))
+        places = coordinates(points).to(sampled.dtype)
+        _, rows = nearest(sampled, places)
+    channels = gather_points(points[..., 3:], rows)
+    columns = [sampled, channels.to(sampled.dtype)]
+    return output._replace(points=torch.cat(columns, -1))

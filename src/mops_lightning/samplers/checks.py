@@ -8,7 +8,10 @@ from mops_lightning.ops.keys import are_finite
 
 
 def check_points(
-    points: Tensor, at_least: int = 1, finite: bool = True, channels: int | None = 0
+    points: Tensor,
+    at_least: int = 1,
+    finite: bool = True,
+    channels: int | None = 0,
 ) -> None:
     """Check that an argument is a batch of clouds with enough points.
 
@@ -26,18 +29,20 @@ def check_points(
         raise UserError(f"points must be a torch.Tensor, got {type(points).__name__}.")
     shape = tuple(points.shape)
     width = 3 + (channels or 0)
-    is_wide_enough = points.ndim == 3 and points.shape[-1] >= width
-    if not is_wide_enough or (channels is not None and points.shape[-1] > width):
+    has_columns = points.ndim == 3 and points.shape[-1] >= width
+    has_too_many = channels is not None and points.shape[-1] > width
+    if not has_columns or has_too_many:
         wanted = f"(B, N, {width})"
         if channels:
             wanted += f", {channels} of them channels beside x, y and z"
         raise UserError(f"points must have shape {wanted}, got {shape}.")
     if not points.is_floating_point():
         raise UserError(f"points must be floating point, got {points.dtype}.")
-    if points.shape[0] == 0 or points.shape[1] == 0:
+    clouds, number = shape[:2]
+    if clouds == 0 or number == 0:
         raise UserError(f"points must have at least one cloud and one point, got shape {shape}.")
-    if points.shape[1] < at_least:
-        raise UserError(f"m must be at most the number of points N={shape[1]}, got m={at_least}.")
+    if number < at_least:
+        raise UserError(f"m must be at most the number of points N={number}, got m={at_least}.")
     if finite and not _are_finite(points):
         raise UserError("points must be finite, got NaN or infinity.")
 

@@ -35,4 +35,5 @@ class CovarianceSampler(ByNormals):
         self, points: NDArray[np.float64], normals: NDArray[np.float64], m: int
     ) -> NDArray[np.int64]:
         """Return the places ``(m,)`` of points ``(N, 3)`` with normals ``(N, 3)``."""
-        return stable_places(plane_rows(points, normals), m)
+        rows = plane_rows(points, normals)
+        return stable_places(rows, m)

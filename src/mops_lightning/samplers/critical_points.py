@@ -69,12 +69,16 @@ class CriticalSampler(Sampler):
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Return m of the points ``(B, N, 3)`` with their indices, in the order of choice."""
         order = seeded_order(coordinates(points), self.seed)
-        return _filled(points, order, *self._chosen(gather_points(points.detach(), order), m))
+        ordered = gather_points(points.detach(), order)
+        rows, counts = self._chosen(ordered, m)
+        return _filled(points, order, rows, counts)
 
     def by_features(self, points: Tensor, features: Tensor, m: int) -> SampleOutput:
         """Choose by non-negative features ``(B, N, C)`` that the points have inside a net."""
         order = seeded_order(points, self.seed)
-        return _filled(points, order, *critical_points(gather_points(features, order), m))
+        ordered = gather_points(features, order)
+        rows, counts = critical_points(ordered, m)
+        return _filled(points, order, rows, counts)
 
     @torch.no_grad()
     def _chosen(self, points: Tensor, m: int) -> tuple[Tensor, Tensor]:
@@ -86,21 +90,27 @@ class CriticalSampler(Sampler):
             )
         like = next(net.parameters(), points)
         modes = {module: module.training for module in net.modules()}
-        batches = points.split(max(1, BATCH_POINTS // points.shape[1]))
+        clouds_at_once = max(1, BATCH_POINTS // points.shape[1])
+        all_rows = []
+        all_counts = []
         net.eval()
         try:
-            parts = [critical_points(net.point_features(part.to(like)), m) for part in batches]
+            for batch in points.split(clouds_at_once):
+                features = net.point_features(batch.to(like))
+                rows, counts = critical_points(features, m)
+                all_rows.append(rows)
+                all_counts.append(counts)
         finally:
             for module, mode in modes.items():
                 module.training = mode
-        rows, counts = zip(*parts, strict=True)
-        return torch.cat(rows).to(points.device), torch.cat(counts).to(points.device)
+        return torch.cat(all_rows).to(points.device), torch.cat(all_counts).to(points.device)
 
 
 def _filled(points: Tensor, order: Tensor, rows: Tensor, counts: Tensor) -> SampleOutput:
     """Return the points in the first ``counts`` rows, then farthest points."""
     places = coordinates(points.detach())
-    filled = farthest_point_fill(gather_points(places, order), rows, counts)
+    ordered = gather_points(places, order)
+    filled = farthest_point_fill(ordered, rows, counts)
     indices = order.gather(1, filled)
     return SampleOutput(gather_points(points, indices), indices, {})
 
@@ -118,6 +128,8 @@ def critical_points(features: Tensor, m: int) -> tuple[Tensor, Tensor]:
         at least one.
     """
     largest, winners = features.max(1)
-    contribution = torch.zeros_like(features[..., 0]).scatter_add_(1, winners, largest)
+    contribution = torch.zeros_like(features[..., 0])
+    contribution = contribution.scatter_add_(1, winners, largest)
     order = contribution.argsort(dim=1, descending=True, stable=True)
-    return order[:, :m], (contribution > 0).sum(1).clamp(1, m)
+    counts = (contribution > 0).sum(1)
+    return order[:, :m], counts.clamp(1, m)

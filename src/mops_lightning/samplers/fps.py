@@ -47,9 +47,9 @@ class FPSSampler(Sampler):
 
     def __init__(self, m: int, seed: int = 0, start: int | str | None = None) -> None:
         super().__init__(m)
-        row = isinstance(start, int) and not isinstance(start, bool) and start >= 0
-        word = isinstance(start, str) and start == FARTHEST
-        if not (row or word or start is None):
+        is_row = isinstance(start, int) and not isinstance(start, bool) and start >= 0
+        is_word = isinstance(start, str) and start == FARTHEST
+        if not (is_row or is_word or start is None):
             raise UserError(
                 f"start must be at least 0, {FARTHEST}, or null (None) to let the seed choose, "
                 f"got {start!r:.99}."
@@ -106,7 +106,8 @@ def farthest_rows(
     if isinstance(start, int):
         first = torch.full((len(points),), start, device=points.device)
     elif start == FARTHEST:
-        first = _first_of_largest(_squares_from_mean(points.detach()), keys)
+        squares = _squares_from_mean(points.detach())
+        first = _first_of_largest(squares, keys)
     elif weight is not None:
         first = _first_of_largest(weight, keys)
     else:
@@ -121,11 +122,13 @@ def _squares_from_mean(points: Tensor) -> Tensor:
     centre = exact_mean(exact)
     squares = torch.zeros_like(exact[..., 0])
     for axis in range(points.shape[2]):
-        squares += (exact[..., axis] - centre[..., axis]).square()
+        apart = exact[..., axis] - centre[..., axis]
+        squares += apart.square()
     return squares
 
 
 def _first_of_largest(values: Tensor, keys: Tensor) -> Tensor:
     """Return the rows ``(B,)`` of the largest values; the lowest key wins a tie."""
-    largest = values == values.amax(1, keepdim=True)
-    return torch.where(largest, keys, torch.iinfo(keys.dtype).max).argmin(1)
+    is_largest = values == values.amax(1, keepdim=True)
+    last = torch.iinfo(keys.dtype).max
+    return torch.where(is_largest, keys, last).argmin(1)

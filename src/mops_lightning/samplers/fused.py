@@ -53,7 +53,8 @@ class FusedMOPSNet(NamedTuple):
     @torch.no_grad()
     def local_features(self, points: Tensor) -> Tensor:
         """Map points ``(N, 3)`` to local features ``(N, D)``."""
-        result = points.new_empty(len(points), len(self.features[-1].bias))
+        width = len(self.features[-1].bias)
+        result = points.new_empty(len(points), width)
         return _in_blocks(self.features, points, result)
 
     @torch.no_grad()
@@ -70,15 +71,17 @@ class FusedMOPSNet(NamedTuple):
         """
         bias = torch.addmv(self.local.bias, self.global_weight, global_)
         layers = (self.local._replace(bias=bias), *self.rest)
-        result = local.new_empty(len(local), self.queries.shape[1]) if into is None else into
-        return _in_blocks(layers, local, result)
+        if into is None:
+            into = local.new_empty(len(local), self.queries.shape[1])
+        return _in_blocks(layers, local, into)
 
     def global_part(self, points: Tensor) -> Tensor:
         """Return the contribution ``(D,)`` of a chunk ``(n, 3)`` to the global feature.
 
         Contributions merge by maximum.
         """
-        peaks = [self.local_features(part).amax(0) for part in points.split(PART)]
+        parts = points.split(PART)
+        peaks = [self.local_features(part).amax(0) for part in parts]
         return torch.stack(peaks).amax(0)
 
     def sum_part(self, points: Tensor, global_: Tensor, m: int) -> Partial:
@@ -92,9 +95,10 @@ class FusedMOPSNet(NamedTuple):
         Returns:
             Sums for m points, with values ``(m, 3)``.
         """
-        queries, parts = self.queries[:m], points.split(PART)
+        parts = points.split(PART)
         keys = (self.keys(self.local_features(part), global_) for part in parts)
-        return reduce(Partial.merge, map(partial(attend, queries), keys, parts))
+        sums = map(partial(attend, self.queries[:m]), keys, parts)
+        return reduce(Partial.merge, sums)
 
 
 def fused_layers(stack: nn.Sequential) -> tuple[Layer, ...]:
@@ -125,7 +129,8 @@ def fused_layer(linear: nn.Linear, norm: nn.BatchNorm1d) -> Layer:
 def _in_blocks(layers: tuple[Layer, ...], rows: Tensor, result: Tensor) -> Tensor:
     """Write the output of layers for rows ``(N, in)`` into ``(N, out)``, block by block."""
     size = BLOCK_ROWS.get(rows.device.type, BLOCK_ROWS["cuda"])
-    for block, out in zip(rows.split(size), result.split(size), strict=True):
+    blocks = zip(rows.split(size), result.split(size), strict=True)
+    for block, out in blocks:
         for layer in layers:
             block = layer(block)
         out.copy_(block)

@@ -62,30 +62,38 @@ class GumbelSampler(Sampler):
         check_channels("feature_channels", feature_channels)
         self.tau_min = tau_min
         self.training_tau = 1.0
-        self.features = PointFeatures(PointMLP([3 + len(self.point_channels), *feature_channels]))
-        self.keys = PointMLP([2 * feature_channels[-1], *KEY_CHANNELS])
+        input_channels = 3 + len(self.point_channels)
+        width = feature_channels[-1]
+        self.features = PointFeatures(PointMLP([input_channels, *feature_channels]))
+        self.keys = PointMLP([2 * width, *KEY_CHANNELS])
         self.queries = nn.Linear(KEY_CHANNELS[-1], m, bias=False)
 
     @property
     def tau(self) -> float:
         """The temperature of training; evaluation has none."""
-        return self.training_tau if self.training else self.tau_min
+        if self.training:
+            return self.training_tau
+        return self.tau_min
 
     def anneal(self, progress: float) -> None:
         """Set the temperature, exponentially from 1 to ``tau_min`` for a progress from 0 to 1."""
-        self.training_tau = self.tau_min ** min(max(progress, 0.0), 1.0)
+        share = min(max(progress, 0.0), 1.0)
+        self.training_tau = self.tau_min**share
 
     def scores(self, points: Tensor) -> Tensor:
         """Return the scores ``(B, m, N)`` of ``(B, N, 3)`` points."""
         local, global_ = self.features(points)
-        keys = self.keys(torch.cat([local, global_[:, None].expand_as(local)], 2))
+        of_points = global_[:, None].expand_as(local)
+        keys = self.keys(torch.cat([local, of_points], 2))
         return self.queries.weight @ keys.to(self.queries.weight).mT
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Choose points; in training, return weighted means that approximate the choice."""
         scores = self.scores(points)
         if not self.training:
-            return SampleOutput(gather_points(points, scores.argmax(2)), None, {})
+            chosen = gather_points(points, scores.argmax(2))
+            return SampleOutput(chosen, None, {})
         noise = -torch.empty_like(scores).exponential_().log()  # of the Gumbel distribution
         weights = ((scores + noise) / self.tau).softmax(2)
-        return SampleOutput(self.point_channels.renormalised(weights @ points), None, {})
+        sampled = self.point_channels.renormalised(weights @ points)
+        return SampleOutput(sampled, None, {})

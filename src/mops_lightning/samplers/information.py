@@ -36,4 +36,5 @@ class InformationSampler(ByNormals):
         self, points: NDArray[np.float64], normals: NDArray[np.float64], m: int
     ) -> NDArray[np.int64]:
         """Return the places ``(m,)`` of points ``(N, 3)`` with normals ``(N, 3)``."""
-        return informative_places(plane_rows(points, normals), m)
+        rows = plane_rows(points, normals)
+        return informative_places(rows, m)

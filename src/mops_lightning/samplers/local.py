@@ -60,7 +60,12 @@ class LocalAnchors(FPSAnchors):
     """
 
     def __init__(
-        self, m: int, channels: int, width: float, candidates: int | None, neighbours: int | None
+        self,
+        m: int,
+        channels: int,
+        width: float,
+        candidates: int | None,
+        neighbours: int | None,
     ) -> None:
         super().__init__(m, channels, width)
         self.candidates = candidates
@@ -87,7 +92,8 @@ class LocalAnchors(FPSAnchors):
         places = points.to(distance_dtype(points))
         thinned = self.thin(places, m)
         candidates = gather_points(places, thinned.rows)
-        keys = keys_of(gather_points(points, thinned.rows), thinned.rows).to(places.dtype)
+        keys = keys_of(gather_points(points, thinned.rows), thinned.rows)
+        keys = keys.to(places.dtype)
         anchors = gather_points(candidates, thinned.anchors)
         content = self._content(gather_points(keys, thinned.anchors), m)
         sharpness = self._sharpness(thinned.unit, m)
@@ -107,11 +113,14 @@ class LocalAnchors(FPSAnchors):
         clouds, n = places.shape[:2]
         wanted = self._wanted(n)
         farthest = rows_from_mean(places, m if wanted is None else wanted)
-        unit = squared_spacing(gather_points(places, farthest[:, :SPACING_POINTS]))
+        first_places = gather_points(places, farthest[:, :SPACING_POINTS])
+        unit = squared_spacing(first_places)
         if wanted is not None:
-            anchors = torch.arange(m, device=places.device).expand(clouds, m)
+            first_rows = torch.arange(m, device=places.device)
+            anchors = first_rows.expand(clouds, m)
             return Thinned(farthest[:, :wanted], anchors, unit)
-        everything = torch.arange(n, device=places.device).expand(clouds, n)
+        all_rows = torch.arange(n, device=places.device)
+        everything = all_rows.expand(clouds, n)
         return Thinned(everything, farthest[:, :m], unit)
 
     def _wanted(self, n: int) -> int | None:
@@ -121,12 +130,15 @@ class LocalAnchors(FPSAnchors):
         wanted = self.candidates * len(self.slots)
         if torch.compiler.is_exporting():  # for any n from least_points
             return wanted
-        return wanted if wanted < n else None
+        if wanted < n:
+            return wanted
+        return None
 
     def _content(self, keys: Tensor, m: int) -> Tensor:
         """Return the vectors ``(B, m, C)`` that are compared with keys."""
         related = keys @ self.relation.to(keys.dtype).mT
-        return self.slots[:m].to(keys.dtype) + related / math.sqrt(keys.shape[2])
+        slots = self.slots[:m].to(keys.dtype)
+        return slots + related / math.sqrt(keys.shape[2])
 
     def _sharpness(self, unit: Tensor, m: int) -> Tensor:
         """Return 1/s_j² ``(B, m)``."""

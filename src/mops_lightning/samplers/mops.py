@@ -116,34 +116,41 @@ class MOPSNet(Sampler):
         self.streams = anchors is None  # farthest points need all points at once
         self.is_thinned = candidates is not None
         local = feature_channels[-1]
-        self.features = PointFeatures(PointMLP([3 + len(self.point_channels), *feature_channels]))
+        input_channels = 3 + len(self.point_channels)
+        self.features = PointFeatures(PointMLP([input_channels, *feature_channels]))
         # The first layer of ρ acts on [local, global]. The product with the global feature is the
         # same for all points of a cloud, so it is computed once per cloud.
         self.rho_local = nn.Linear(local, rho_channels[0], bias=False)
         self.rho_global = nn.Linear(local, rho_channels[0], bias=False)
-        self.rho_first = nn.Sequential(nn.BatchNorm1d(rho_channels[0]), nn.ReLU(inplace=True))
+        norm = nn.BatchNorm1d(rho_channels[0])
+        self.rho_first = nn.Sequential(norm, nn.ReLU(inplace=True))
         self.rho = linear_norm_relu(rho_channels)
+        width = rho_channels[-1]
         self.queries: nn.Linear | FPSAnchors
         if anchors is None:
             # A bias would be constant within a column of S, where the softmax cancels it.
-            self.queries = nn.Linear(rho_channels[-1], m, bias=False)
+            self.queries = nn.Linear(width, m, bias=False)
         elif candidates is None and neighbours is None:
-            self.queries = FPSAnchors(m, rho_channels[-1], anchor_width)
+            self.queries = FPSAnchors(m, width, anchor_width)
         else:
-            self.queries = LocalAnchors(m, rho_channels[-1], anchor_width, candidates, neighbours)
+            self.queries = LocalAnchors(m, width, anchor_width, candidates, neighbours)
 
     @property
     def tau(self) -> float:
         """The current temperature: annealed in training, ``tau_min`` in evaluation."""
-        return self.training_tau if self.training else self.tau_min
+        if self.training:
+            return self.training_tau
+        return self.tau_min
 
     def anneal(self, progress: float) -> None:
         """Set tau, exponentially from 1 to ``tau_min`` for a progress from 0 to 1."""
-        self.training_tau = self.tau_min ** min(max(progress, 0.0), 1.0)
+        share = min(max(progress, 0.0), 1.0)
+        self.training_tau = self.tau_min**share
 
     def sampling_matrix(self, points: Tensor, m: int | None = None) -> SamplingMatrix | LocalMatrix:
         """Return the sampling matrices S of ``(B, N, 3 + C)`` points, with the first m columns."""
-        m = self.m if m is None else m
+        if m is None:
+            m = self.m
         places = coordinates(points)
         if isinstance(self.queries, LocalAnchors):
 
@@ -166,9 +173,11 @@ class MOPSNet(Sampler):
             return self._fused_keys(points)
         local, global_ = self.features(points)
         with pointwise_autocast(points.device.type):
-            hidden = self.rho_local(local).add_(self.rho_global(global_)[:, None])
+            from_global = self.rho_global(global_)[:, None]
+            hidden = self.rho_local(local).add_(from_global)
             rows = self.rho(self.rho_first(hidden.flatten(0, 1)))
-        return rows.to(self.queries.weight).unflatten(0, points.shape[:2])
+        keys = rows.to(self.queries.weight)
+        return keys.unflatten(0, points.shape[:2])
 
     def fused(self) -> FusedMOPSNet:
         """Return the network for inference with BatchNorm fused, with copies of the weights.
@@ -196,9 +205,12 @@ class MOPSNet(Sampler):
     def _fused_keys(self, points: Tensor) -> Tensor:
         """Return the keys without gradients, from the fused network."""
         net = self._fused()
-        local = net.local_features(points.flatten(0, 1)).unflatten(0, points.shape[:2])
-        keys = local.new_empty(*local.shape[:2], net.queries.shape[1])
-        for cloud, peak, into in zip(local, local.amax(1), keys, strict=True):
+        rows = net.local_features(points.flatten(0, 1))
+        local = rows.unflatten(0, points.shape[:2])
+        peaks = local.amax(1)
+        clouds, number, _ = local.shape
+        keys = local.new_empty(clouds, number, net.queries.shape[1])
+        for cloud, peak, into in zip(local, peaks, keys, strict=True):
             net.keys(cloud, peak, into)
         return keys
 
@@ -222,7 +234,9 @@ class MOPSNet(Sampler):
         With ``overlap``, also the penalty on columns that choose the same points.
         """
         subset = subset_losses(points, output.points, sizes)
-        losses = {m: {"subset": self.alpha * loss} for m, loss in subset.items()}
+        losses = {}
+        for m, loss in subset.items():
+            losses[m] = {"subset": self.alpha * loss}
         if self.overlap and output.matrix is not None:
             for m, loss in overlap_losses(output.matrix, sizes).items():
                 losses[m]["overlap"] = self.overlap * loss
@@ -240,5 +254,6 @@ def check_local(anchors: str | None, **settings: int | None) -> None:
             continue
         if anchors is None:
             raise UserError(f"{name} needs anchors=fps, got {name}={value!r}.")
-        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        is_whole = isinstance(value, int) and not isinstance(value, bool)
+        if not is_whole or value < 1:
             raise UserError(f"{name} must be a whole number of at least 1 or null, got {value!r}.")

@@ -39,7 +39,8 @@ def seeded_order(points: Tensor, seed: int, in_sphere: bool = False) -> Tensor:
     """
     random = seeded_keys(points, seed, in_sphere)
     if random.is_cpu:  # NumPy's vectorised sort is several times faster than torch's
-        return torch.from_numpy(np.argsort(random.numpy(), axis=1, kind="stable"))
+        order = np.argsort(random.numpy(), axis=1, kind="stable")
+        return torch.from_numpy(order)
     return random.argsort(dim=1, stable=True)
 
 
@@ -48,7 +49,8 @@ def seeded_keys(points: Tensor, seed: int, in_sphere: bool = False) -> Tensor:
     given = points.detach()
     if given.is_cpu:
         numbers = given.to(distance_dtype(given)).numpy()
-        return torch.from_numpy(keys.seeded_keys(numbers, SeededOrder(seed, in_sphere)))
+        order = SeededOrder(seed, in_sphere)
+        return torch.from_numpy(keys.seeded_keys(numbers, order))
     if in_sphere:
         given = in_unit_sphere(given)
     return _keys_on_device(given, seed)
@@ -59,12 +61,14 @@ def _keys_on_device(points: Tensor, seed: int) -> Tensor:
     values, order = hashes.sort(dim=1, stable=True)
     is_copy = values[:, 1:] == values[:, :-1]
     if bool(is_copy.any()):
-        place = torch.arange(points.shape[1], device=points.device).expand_as(order)
+        numbers = torch.arange(points.shape[1], device=points.device)
+        place = numbers.expand_as(order)
         first = place.clone()
         first[:, 1:].masked_fill_(is_copy, 0)
         number_of_copy = place - first.cummax(1).values
         # First copies keep their keys, so that clouds without copies do not depend on the batch.
-        scrambled = _scramble(values + number_of_copy * _signed(STEP))
+        steps = number_of_copy * _signed(STEP)
+        scrambled = _scramble(values + steps)
         values = torch.where(number_of_copy > 0, scrambled, values)
         hashes = torch.empty_like(hashes).scatter_(1, order, values)
     return hashes
@@ -76,9 +80,11 @@ def in_unit_sphere(points: Tensor) -> Tensor:
     centred = exact - exact_mean(exact)
     squares = torch.zeros_like(exact[..., :1])
     for axis in range(points.shape[2]):
-        squares += centred[..., axis : axis + 1].square()
+        along = centred[..., axis : axis + 1]
+        squares += along.square()
     radius = squares.amax(1, keepdim=True).sqrt()
-    return (centred / torch.where(radius > 0, radius, 1.0)).float()
+    radius = torch.where(radius > 0, radius, 1.0)
+    return (centred / radius).float()
 
 
 def exact_mean(points: Tensor) -> Tensor:
@@ -89,22 +95,29 @@ def exact_mean(points: Tensor) -> Tensor:
     largest = points.abs().amax((1, 2), keepdim=True)
     exponent = SUM_BITS - torch.frexp(largest).exponent
     units = torch.ldexp(torch.ones_like(largest), exponent)
-    whole = (points * units.clamp_max(2.0**1000)).round().long()
+    scaled = points * units.clamp_max(2.0**1000)
+    whole = scaled.round().long()
     # The sum of all 51 bits would exceed 64 bits.
-    high = (whole >> 26).sum(1, keepdim=True).double()
-    low = (whole & (2**26 - 1)).sum(1, keepdim=True).double()
-    return (high * 2.0**26 + low) / points.shape[1] / units
+    high_bits = whole >> 26
+    low_bits = whole & (2**26 - 1)
+    high = high_bits.sum(1, keepdim=True).double()
+    low = low_bits.sum(1, keepdim=True).double()
+    total = high * 2.0**26 + low
+    return total / points.shape[1] / units
 
 
 def smallest(keys: Tensor, m: int) -> Tensor:
     """Return the rows ``(B, m)`` of the m smallest keys ``(B, N)`` of every cloud, ascending."""
     if not keys.is_cpu or m == keys.shape[1]:
-        return keys.argsort(dim=1, stable=True)[:, :m].contiguous()
+        sorted_rows = keys.argsort(dim=1, stable=True)
+        return sorted_rows[:, :m].contiguous()
     values = keys.numpy()
-    rows = np.argpartition(values, m - 1, axis=1)[:, :m]
+    partition = np.argpartition(values, m - 1, axis=1)
+    rows = partition[:, :m]
     keys_of_rows = np.take_along_axis(values, rows, 1)
     order = np.argsort(keys_of_rows, axis=1)
-    return torch.from_numpy(np.take_along_axis(rows, order, 1))
+    ordered_rows = np.take_along_axis(rows, order, 1)
+    return torch.from_numpy(ordered_rows)
 
 
 def compiled_hashes(points: Tensor, seed: int) -> NDArray[np.uint64]:
@@ -130,11 +143,14 @@ def point_hashes(points: Tensor, seed: int) -> Tensor:
     """
     # int64 products wrap on every device, as the hash requires; + 0.0 turns -0 into 0.
     bits = (points.double() + 0.0).view(torch.int64)
-    keys = torch.full_like(bits[..., 0], _signed(seed * STEP + 1))
+    start = _signed(seed * STEP + 1)
+    keys = torch.full_like(bits[..., 0], start)
     for axis in range(points.shape[2]):
-        keys = keys.bitwise_xor_(bits[..., axis]).mul_(_signed(FIRST))
+        keys = keys.bitwise_xor_(bits[..., axis])
+        keys = keys.mul_(_signed(FIRST))
         keys = _xor_shift(keys, 32)
-    of_cloud = _xor_shift(keys, 29).mul_(_signed(SECOND)).sum(1, keepdim=True)
+    words = _xor_shift(keys, 29).mul_(_signed(SECOND))
+    of_cloud = words.sum(1, keepdim=True)
     return _scramble(keys.add_(of_cloud))
 
 
@@ -147,10 +163,14 @@ def _scramble(keys: Tensor) -> Tensor:
 
 def _xor_shift(keys: Tensor, shift: int) -> Tensor:
     """Return ``keys ^ (keys >> shift)`` with an unsigned shift."""
-    return (keys >> shift).bitwise_and_(2 ** (64 - shift) - 1).bitwise_xor_(keys)
+    low_bits = 2 ** (64 - shift) - 1
+    shifted = (keys >> shift).bitwise_and_(low_bits)
+    return shifted.bitwise_xor_(keys)
 
 
 def _signed(word: int) -> int:
     """Return the int64 with the bits of ``word`` modulo 2⁶⁴."""
     word %= WORD
-    return word - WORD if word >= WORD // 2 else word
+    if word >= WORD // 2:
+        return word - WORD
+    return word

@@ -91,7 +91,9 @@ def poisson_rows(
     """
     order = seeded_order(points, seed, in_sphere)
     ordered = gather_points(points.detach(), order)
-    shares = None if weight is None else weight.gather(1, order)
+    shares = None
+    if weight is not None:
+        shares = weight.gather(1, order)
     return order.gather(1, eliminate(ordered, m, shares))
 
 
@@ -108,14 +110,20 @@ def eliminate(points: Tensor, m: int, weight: Tensor | None = None) -> Tensor:
         ``(B, m)`` int64 rows of ``points``, ascending.
     """
     number = points.shape[1]
-    reach = spacing_bound(points, m).clamp_min(torch.finfo(torch.float64).tiny)
+    tiny = torch.finfo(torch.float64).tiny
+    reach = spacing_bound(points, m).clamp_min(tiny)
     # Sums of integers do not depend on the order of the points.
     scale = 2.0 ** min(50, 62 - number.bit_length())
     shares = np.empty((len(points), 0))
     if weight is not None:
-        shares = (weight.double().amin(1, keepdim=True) / weight.double()).cpu().numpy()
-    clouds = zip(points.double().cpu().numpy(), reach.flatten().tolist(), shares, strict=True)
-    remaining = [_least_crowded(cloud, m, bound, share, scale) for cloud, bound, share in clouds]
+        exact = weight.double()
+        relative = exact.amin(1, keepdim=True) / exact
+        shares = relative.cpu().numpy()
+    remaining = []
+    arrays = points.double().cpu().numpy()
+    bounds = reach.flatten().tolist()
+    for cloud, bound, share in zip(arrays, bounds, shares, strict=True):
+        remaining.append(_least_crowded(cloud, m, bound, share, scale))
     return torch.from_numpy(np.stack(remaining)).to(points.device)
 
 
@@ -133,26 +141,37 @@ def spacing_bound(points: Tensor, m: int) -> Tensor:
         ``(B, 1)`` float64.
     """
     if m == 1:
-        spans = points.double().amax(1) - points.double().amin(1)
+        exact = points.double()
+        spans = exact.amax(1) - exact.amin(1)
         return torch.linalg.vector_norm(spans, dim=1, keepdim=True)
-    chosen = gather_points(points, farthest_point_sample(points, m)).double()
-    last = torch.linalg.vector_norm(chosen[:, :-1] - chosen[:, -1:], dim=2)
-    return 2 * last.amin(1, keepdim=True)
+    rows = farthest_point_sample(points, m)
+    chosen = gather_points(points, rows).double()
+    to_last = chosen[:, :-1] - chosen[:, -1:]
+    distances = torch.linalg.vector_norm(to_last, dim=2)
+    return 2 * distances.amin(1, keepdim=True)
 
 
 def _least_crowded(
-    points: NDArray[np.float64], m: int, reach: float, shares: NDArray[np.float64], scale: float
+    points: NDArray[np.float64],
+    m: int,
+    reach: float,
+    shares: NDArray[np.float64],
+    scale: float,
 ) -> NDArray[np.int64]:
     """Return the m rows of ``(N, C)`` points that remain, ascending."""
-    padded = np.pad(points, ((0, 0), (0, max(3 - points.shape[1], 0))))
-    order = np.argsort(morton_codes(torch.from_numpy(padded[None, :, :3]))[0].numpy())
+    missing_axes = max(3 - points.shape[1], 0)
+    padded = np.pad(points, ((0, 0), (0, missing_axes)))
+    coordinates = torch.from_numpy(padded[None, :, :3])
+    order = np.argsort(morton_codes(coordinates)[0].numpy())
+    if len(shares):
+        shares = shares[order]
     farthest = reach * (1 - scale**-0.125)  # from here on, weights are less than 1
     limit = farthest * farthest * (1 + 1e-9) + SMALLEST
     rows = kernel_elimination.eliminate(
         np.ascontiguousarray(padded[order].T).ravel(),
         padded.shape[1],
         order,
-        shares[order] if len(shares) else shares,
+        shares,
         m,
         limit,
         1 / reach,

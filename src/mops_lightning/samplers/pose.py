@@ -81,16 +81,19 @@ class PoseSampler(Sampler):
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Return m of the points ``(B, N, 3)`` with their indices, in the order of choice."""
         order = seeded_order(points, self.seed)
-        ordered = gather_points(points.detach(), order).double().cpu().numpy()
-        surroundings = [describe_neighbourhoods(cloud) for cloud in ordered]
-        features = torch.from_numpy(np.stack([each.features for each in surroundings]))
+        ordered = gather_points(points.detach(), order)
+        clouds = ordered.double().cpu().numpy()
+        surroundings = [describe_neighbourhoods(cloud) for cloud in clouds]
+        feature_arrays = np.stack([surrounding.features for surrounding in surroundings])
+        features = torch.from_numpy(feature_arrays)
         predicted = self.log_residuals(features.to(self.last.weight))
         spreads = predicted.detach().double().exp().cpu().numpy()
-        places = [
-            steady_places(plane_rows(cloud, each.normals), spread, m)
-            for cloud, each, spread in zip(ordered, surroundings, spreads, strict=True)
-        ]
-        indices = order.gather(1, torch.from_numpy(np.stack(places)).to(order))
+        places = []
+        for cloud, surrounding, spread in zip(clouds, surroundings, spreads, strict=True):
+            rows = plane_rows(cloud, surrounding.normals)
+            places.append(steady_places(rows, spread, m))
+        chosen = torch.from_numpy(np.stack(places)).to(order)
+        indices = order.gather(1, chosen)
         back = torch.empty_like(order).scatter_(1, order, _ranks(order))
         return SampleOutput(
             gather_points(points, indices), indices, {}, log_residuals=predicted.gather(1, back)
@@ -100,10 +103,14 @@ class PoseSampler(Sampler):
         """Return the logarithms ``(B, N)`` of the residuals from features ``(B, N, FEATURES)``."""
         local = self.features(features).to(self.last.weight)  # half precision in autocast
         of_cloud = torch.cat([local.mean(1), local.amax(1)], 1)
-        both = torch.cat([local, of_cloud[:, None].expand(-1, local.shape[1], -1)], 2)
-        rows = self.last(self.head(both.flatten(0, 1)))[:, 0]
-        return rows.clamp(-LARGEST, LARGEST).unflatten(0, features.shape[:2])
+        of_points = of_cloud[:, None].expand(-1, local.shape[1], -1)
+        both = torch.cat([local, of_points], 2)
+        hidden = self.head(both.flatten(0, 1))
+        residuals = self.last(hidden)[:, 0]
+        clamped = residuals.clamp(-LARGEST, LARGEST)
+        return clamped.unflatten(0, features.shape[:2])
 
 
 def _ranks(order: Tensor) -> Tensor:
-    return torch.arange(order.shape[1], device=order.device).expand_as(order)
+    ranks = torch.arange(order.shape[1], device=order.device)
+    return ranks.expand_as(order)

@@ -1,5 +1,6 @@
 """Input clouds: arrays or tensors, one or many, of one or several sizes."""
 
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -39,7 +40,11 @@ class Method(NamedTuple):
 
 
 def select_points(
-    method: Method, points: Any, m: int, batch: Any = None, weight: Any = None
+    method: Method,
+    points: Any,
+    m: int,
+    batch: Any = None,
+    weight: Any = None,
 ) -> tuple[Any, Any]:
     """Select points of clouds in their own unit.
 
@@ -56,15 +61,19 @@ def select_points(
     tensor = as_tensor("points", points)
     is_array = isinstance(points, np.ndarray)
     if not tensor.is_floating_point():
-        conversion = "astype(float)" if is_array else "float()"
+        conversion = "float()"
+        if is_array:
+            conversion = "astype(float)"
         raise UserError(
             f"points must be floating point, got {tensor.dtype}. Try points.{conversion}."
         )
     if weight is not None and not isinstance(weight, str):
-        weight = check_weight(weight, tuple(tensor.shape[:-1])).to(tensor.device)
+        shape = tuple(tensor.shape[:-1])
+        weight = check_weight(weight, shape).to(tensor.device)
     _check_shape(tensor, method, batch is not None)
     if batch is not None:
-        chosen, rows = _flat(method, tensor, m, as_tensor("batch", batch), weight)
+        cloud_of_point = as_tensor("batch", batch)
+        chosen, rows = _flat(method, tensor, m, cloud_of_point, weight)
     elif tensor.ndim == 2:
         chosen, rows = _one(method, tensor, m, weight)
     else:
@@ -94,16 +103,21 @@ def _first(chosen: Tensor, rows: Tensor | None, cloud: int = 0) -> Sample:
 def _check_shape(points: Tensor, method: Method, is_flat: bool) -> None:
     """Refuse points without the columns of a method, and channels that are not numbers."""
     channels = method.channels
-    width = 3 + len(channels)
-    dimensions = (2,) if is_flat else (2, 3)
-    has_all = points.ndim in dimensions and points.shape[-1] >= width
-    has_more = points.shape[-1] > width
-    if not has_all or (has_more and not method.any_channels):
-        wanted = f"(P, {width}) with batch" if is_flat else f"(N, {width}) or (B, N, {width})"
+    least = 3 + len(channels)
+    width = points.shape[-1]
+    wanted = f"(N, {least}) or (B, N, {least})"
+    has_dimensions = points.ndim in (2, 3)
+    if is_flat:
+        wanted = f"(P, {least}) with batch"
+        has_dimensions = points.ndim == 2
+    is_wide_enough = width == least or (width > least and method.any_channels)
+    if not has_dimensions or not is_wide_enough:
         of_channels = ""
         if channels:
-            of_channels = f" with columns x, y, z, {', '.join(channels.names)}"
-        raise UserError(f"points must have shape {wanted}{of_channels}, got {tuple(points.shape)}.")
+            names = ", ".join(channels.names)
+            of_channels = f" with columns x, y, z, {names}"
+        shape = tuple(points.shape)
+        raise UserError(f"points must have shape {wanted}{of_channels}, got {shape}.")
     channels.check_known(points[..., 3:], "points")
 
 
@@ -111,12 +125,14 @@ def _flat(method: Method, points: Tensor, m: int, batch: Tensor, weight: Weight)
     """Select from clouds one after the other; rows count through all clouds."""
     counts = cloud_sizes(len(points), batch).tolist()
     if 0 in counts:
-        raise UserError(f"batch: cloud {counts.index(0)} has no points. Number clouds from 0.")
+        empty = counts.index(0)
+        raise UserError(f"batch: cloud {empty} has no points. Number clouds from 0.")
     weights: Sequence[Weight] = [weight] * len(counts)
     if isinstance(weight, Tensor):
         weights = weight.split(counts)
-    samples = _each(method, list(points.split(counts)), m, weights)
-    chosen = torch.cat([sample[0] for sample in samples])
+    clouds = list(points.split(counts))
+    samples = _each(method, clouds, m, weights)
+    chosen = torch.cat([points_of_cloud for points_of_cloud, _ in samples])
     all_rows = []
     start = 0
     for count, (_, rows) in zip(counts, samples, strict=True):
@@ -132,8 +148,10 @@ def _each(method: Method, clouds: list[Tensor], m: int, weights: Sequence[Weight
     if not clouds:
         raise UserError("points must have at least one cloud.")
     samples: dict[int, Sample] = {}
-    for size in sorted({len(cloud) for cloud in clouds}):
-        members = [number for number, cloud in enumerate(clouds) if len(cloud) == size]
+    members_of_size: dict[int, list[int]] = defaultdict(list)
+    for number, cloud in enumerate(clouds):
+        members_of_size[len(cloud)].append(number)
+    for size, members in sorted(members_of_size.items()):
         if size < m:
             everything = torch.arange(size, device=clouds[0].device)
             for number in members:
@@ -157,10 +175,10 @@ def _together(weights: Sequence[Weight]) -> Weight:
 
 def _selected(method: Method, points: Tensor, m: int, weight: Weight) -> Sample:
     """Select from clouds of one size, in their own unit."""
-    if points.shape[0] == 0 or points.shape[1] == 0:
-        raise UserError(
-            f"points must have at least one cloud and one point, got shape {tuple(points.shape)}."
-        )
+    clouds, number = points.shape[:2]
+    if clouds == 0 or number == 0:
+        shape = tuple(points.shape)
+        raise UserError(f"points must have at least one cloud and one point, got shape {shape}.")
     if isinstance(weight, str):
         weight = _computed(weight, points)
     if weight is not None and not bool(weight.all()):
@@ -172,7 +190,11 @@ def _selected(method: Method, points: Tensor, m: int, weight: Weight) -> Sample:
 
 
 def select_in_unit_sphere(
-    select: Select, channels: PointChannels, points: Tensor, m: int, weight: Tensor | None
+    select: Select,
+    channels: PointChannels,
+    points: Tensor,
+    m: int,
+    weight: Tensor | None,
 ) -> Sample:
     """Move clouds into the unit sphere, as float32, select points, and map them back.
 
@@ -188,7 +210,8 @@ def select_in_unit_sphere(
     centred = exact - centre
     x, y, z = centred.unbind(2)
     # Four times as fast as a norm along three columns.
-    radius = (x * x + y * y + z * z).amax(1).sqrt()[:, None, None]
+    squares = x * x + y * y + z * z
+    radius = squares.amax(1).sqrt()[:, None, None]
     radius = torch.where(radius > 0, radius, 1.0)
     seen = centred.div_(radius).float()
     if channels:
@@ -197,7 +220,8 @@ def select_in_unit_sphere(
     chosen, rows = select(seen, m, weight)
     restored = coordinates(chosen).double() * radius + centre
     if channels:
-        restored = torch.cat([restored, channels.restored(chosen[..., 3:].double())], 2)
+        values = channels.restored(chosen[..., 3:].double())
+        restored = torch.cat([restored, values], 2)
     return restored.to(points.dtype), rows
 
 
@@ -219,7 +243,9 @@ def _without_zeros(method: Method, points: Tensor, m: int, weight: Tensor) -> Sa
     for cloud, weight_of_cloud in zip(points, weight, strict=True):
         heavy = weight_of_cloud.nonzero()[:, 0]
         check_positive(len(heavy), m)
-        chosen, rows = _selected(method, cloud[heavy][None], m, weight_of_cloud[heavy][None])
+        heavy_points = cloud[heavy]
+        heavy_weight = weight_of_cloud[heavy]
+        chosen, rows = _selected(method, heavy_points[None], m, heavy_weight[None])
         assert rows is not None  # generated points have no weights
         all_chosen.append(chosen[0])
         all_rows.append(heavy[rows[0]])

@@ -40,7 +40,8 @@ class RandomSampler(Sampler):
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Return m of the points ``(B, N, 3)`` with their indices, in random order."""
-        indices = smallest(seeded_keys(points, self.seed), m)
+        keys = seeded_keys(points, self.seed)
+        indices = smallest(keys, m)
         return SampleOutput(gather_points(points, indices), indices, {})
 
     def sample_weighted(self, points: Tensor, m: int, weight: Tensor) -> Tensor:
@@ -49,12 +50,14 @@ class RandomSampler(Sampler):
         Efraimidis and Spirakis, "Weighted random sampling with a reservoir", Information Processing
         Letters 2006, as times of exponential clocks: ``torch.multinomial`` takes up to 2²⁴ points.
         """
-        return _drawn(seeded_order(points, self.seed), m, weight, self.seed)
+        order = seeded_order(points, self.seed)
+        return _drawn(order, m, weight, self.seed)
 
     def choose_rows(self, points: Tensor, m: int, weight: Tensor | None = None) -> Tensor:
         """Choose as ``sample`` and ``sample_weighted`` do, in any unit."""
         if weight is None:
-            return smallest(seeded_keys(points, self.seed, in_sphere=True), m)
+            keys = seeded_keys(points, self.seed, in_sphere=True)
+            return smallest(keys, m)
         order = seeded_order(points, self.seed, in_sphere=True)
         return _drawn(order, m, weight, self.seed)
 
@@ -62,6 +65,9 @@ class RandomSampler(Sampler):
 def _drawn(order: Tensor, m: int, weight: Tensor, seed: int) -> Tensor:
     """Draw rows ``(B, m)`` by weights ``(B, N)``, from seeded orders ``(B, N)``."""
     generator = torch.Generator().manual_seed(seed)
-    times = torch.empty(order.shape[1], dtype=torch.float64).exponential_(generator=generator)
-    times = times.to(order.device) / weight.double().gather(1, order)
-    return order.gather(1, times.argsort(1)[:, :m])
+    arrivals = torch.empty(order.shape[1], dtype=torch.float64)
+    arrivals.exponential_(generator=generator)
+    ordered_weight = weight.double().gather(1, order)
+    times = arrivals.to(order.device) / ordered_weight
+    first = times.argsort(1)[:, :m]
+    return order.gather(1, first)

@@ -13,7 +13,16 @@ from mops_lightning.types import SampleOutput
 BITS = 21
 """Bits of a coordinate: three of them fill an int64 but for its sign."""
 
-SPREAD = np.array([sum((n >> bit & 1) << 3 * bit for bit in range(11)) for n in range(2**11)])
+
+def _spread_bits(number: int) -> int:
+    """Return a number of 11 bits with two zeros between its bits."""
+    spread = 0
+    for bit in range(11):
+        spread += (number >> bit & 1) << 3 * bit
+    return spread
+
+
+SPREAD = np.array([_spread_bits(number) for number in range(2**11)])
 """Numbers of 11 bits with two zeros after every bit."""
 
 
@@ -40,18 +49,22 @@ class SerialSampler(Sampler):
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Return m of the points ``(B, N, 3)`` with their indices, along the curve."""
-        indices = _every_kth(along_curve(points), m)
+        along = along_curve(points)
+        indices = _every_kth(along, m)
         return SampleOutput(gather_points(points, indices), indices, {})
 
     def choose_rows(self, points: Tensor, m: int, weight: Tensor | None = None) -> Tensor:
         """Choose as ``sample`` does, in any unit; without weights."""
-        return _every_kth(along_curve(points, in_sphere=True), m)
+        along = along_curve(points, in_sphere=True)
+        return _every_kth(along, m)
 
 
 def _every_kth(along: Tensor, m: int) -> Tensor:
     """Return m rows ``(B, m)`` at equal distances among rows ``(B, N)``."""
-    places = torch.arange(m, device=along.device) * 2 + 1
-    return along[:, places * along.shape[1] // (2 * m)]
+    # The middles of m equal parts of the curve.
+    halves = torch.arange(m, device=along.device) * 2 + 1
+    places = halves * along.shape[1] // (2 * m)
+    return along[:, places]
 
 
 def along_curve(points: Tensor, in_sphere: bool = False) -> Tensor:
@@ -62,7 +75,8 @@ def along_curve(points: Tensor, in_sphere: bool = False) -> Tensor:
     codes = morton_codes(points).numpy()
     order = np.argsort(codes, axis=1)
     ordered = np.take_along_axis(codes, order, 1)
-    if (ordered[:, 1:] == ordered[:, :-1]).any():
+    is_copy = ordered[:, 1:] == ordered[:, :-1]
+    if is_copy.any():
         keys = seeded_keys(points, 0, in_sphere).cpu().numpy()
         order = np.lexsort((keys, codes), axis=1)
     return torch.from_numpy(order).to(points.device)

@@ -62,19 +62,21 @@ class SNet(Sampler):
         self.alpha = alpha
         self.coverage = coverage
         self.coverage_per_point = coverage_per_point
-        self.features = PointMLP([3 + len(self.point_channels), *feature_channels[:-1]])
+        input_channels = 3 + len(self.point_channels)
+        self.features = PointMLP([input_channels, *feature_channels[:-1]])
         self.pool = PointMaxPool(feature_channels[-2], feature_channels[-1])
-        layers: list[nn.Module] = list(
-            linear_norm_relu([feature_channels[-1], *head_channels], head_norm)
-        )
-        layers += [nn.Linear(head_channels[-1], 3 * m, bias=not output_norm)]
-        layers += [nn.BatchNorm1d(3 * m)] if output_norm else []
+        hidden = linear_norm_relu([feature_channels[-1], *head_channels], head_norm)
+        layers: list[nn.Module] = list(hidden)
+        layers.append(nn.Linear(head_channels[-1], 3 * m, bias=not output_norm))
+        if output_norm:
+            layers.append(nn.BatchNorm1d(3 * m))
         self.head = nn.Sequential(*layers)
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Generate points; see ``Sampler.forward``."""
-        coordinates = self.head(self.pool(self.features(points)))
-        return SampleOutput(coordinates.unflatten(1, (self.m, 3))[:, :m], None, {})
+        of_cloud = self.pool(self.features(points))
+        coordinates = self.head(of_cloud).unflatten(1, (self.m, 3))
+        return SampleOutput(coordinates[:, :m], None, {})
 
     def losses(
         self, points: Tensor, output: SampleOutput, sizes: Sequence[int]

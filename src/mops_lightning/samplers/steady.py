@@ -36,4 +36,6 @@ class SteadySampler(ByNormals):
         self, points: NDArray[np.float64], normals: NDArray[np.float64], m: int
     ) -> NDArray[np.int64]:
         """Return the places ``(m,)`` of points ``(N, 3)`` with normals ``(N, 3)``."""
-        return steady_places(plane_rows(points, normals), np.ones(len(points)), m)
+        rows = plane_rows(points, normals)
+        equal_spread = np.ones(len(points))
+        return steady_places(rows, equal_spread, m)

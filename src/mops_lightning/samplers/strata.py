@@ -9,7 +9,10 @@ from mops_lightning.errors import UserError
 
 
 def share_among_classes(
-    counts: Mapping[int, int], m: int, least: int | None = None, prefix: str = ""
+    counts: Mapping[int, int],
+    m: int,
+    least: int | None = None,
+    prefix: str = "",
 ) -> dict[int, int]:
     """Share m points among classes.
 
@@ -28,7 +31,8 @@ def share_among_classes(
     """
     given = dict.fromkeys(sorted(counts), 0)
     if least is not None:
-        given = {name: min(least, counts[name]) for name in given}
+        for name in given:
+            given[name] = min(least, counts[name])
     needed = sum(given.values())
     if needed > m:
         raise UserError(
@@ -36,27 +40,32 @@ def share_among_classes(
             f"{needed}, more than {prefix}m {m}."
         )
     total = sum(counts.values())
-    wanted = {name: max(m * counts[name] / total, given[name]) for name in given}
+    wanted = {}
+    for name in given:
+        share = m * counts[name] / total
+        wanted[name] = max(share, given[name])
     return _rounded(given, wanted, counts, m)
 
 
 def _rounded(
-    given: dict[int, int], wanted: dict[int, float], counts: Mapping[int, int], m: int
+    given: dict[int, int],
+    wanted: dict[int, float],
+    counts: Mapping[int, int],
+    m: int,
 ) -> dict[int, int]:
     """Add points to the classes that lack most of what they are to have, until there are m."""
     open_classes = {name for name in given if wanted[name] > given[name]}
     left = m - sum(given.values())
-    spare = sum(wanted[name] - given[name] for name in open_classes)
+    missing_of = {name: wanted[name] - given[name] for name in open_classes}
+    spare = sum(missing_of.values())
     shares = dict(given)
+    remainders: dict[int, float] = {}
     if spare:
         # Where some classes keep more than their share, the others give in proportion.
         for name in open_classes:
-            shares[name] += int(left * (wanted[name] - given[name]) / spare)
-    remainders = {
-        name: given[name] + left * (wanted[name] - given[name]) / spare - shares[name]
-        for name in open_classes
-        if spare
-    }
+            more = left * missing_of[name] / spare
+            shares[name] += int(more)
+            remainders[name] = given[name] + more - shares[name]
     by_remainder = sorted(remainders, key=lambda name: (-remainders[name], name))
     others = [name for name in given if name not in remainders]
     missing = m - sum(shares.values())

@@ -29,7 +29,11 @@ NEIGHBOURS = 8
 
 
 def sample_by_tiles(
-    points: Points, size: int, m: int, sampler: Sampler, channels: Tensor | None = None
+    points: Points,
+    size: int,
+    m: int,
+    sampler: Sampler,
+    channels: Tensor | None = None,
 ) -> Rows:
     """Sample every tile of a cloud, then thin the points where tiles meet.
 
@@ -56,14 +60,16 @@ def sample_by_tiles(
     sampled = m
     if is_thinned:
         sampled = min(int(EXTRA * m), len(points))
-    numbers = np.minimum(shares(sampled, sizes), sampler.m).tolist()
+    proportional = shares(sampled, sizes)
+    numbers = np.minimum(proportional, sampler.m).tolist()
     if sum(numbers) < m:
         raise UserError(
             f"--m: {len(tiles)} tiles of up to {max(sizes)} points would keep {m} points, but the "
             f"sampler was trained for up to {sampler.m} points of each. Use smaller tiles, or keep "
             "fewer points."
         )
-    selected: list[Rows] = [np.empty(0, np.int64)] * len(tiles)
+    no_rows: Rows = np.empty(0, np.int64)
+    selected = [no_rows] * len(tiles)
     for batch in _batches(sizes, numbers):
         batch_of_tiles = [tiles[number] for number in batch]
         stacked = _stacked(sampler, points, batch_of_tiles, channels)
@@ -71,7 +77,8 @@ def sample_by_tiles(
         for number, rows_in_tile in zip(batch, rows, strict=True):
             selected[number] = tiles[number][rows_in_tile]
     kept = np.concatenate(selected)
-    return np.sort(kept[thin(points[kept], m)])
+    spaced = thin(points[kept], m)
+    return np.sort(kept[spaced])
 
 
 def _batches(sizes: list[int], numbers: list[int]) -> Iterator[list[int]]:
@@ -82,7 +89,8 @@ def _batches(sizes: list[int], numbers: list[int]) -> Iterator[list[int]]:
         numbers: points to keep of every tile; tiles that keep none are left out.
     """
     alike: dict[tuple[int, int], list[int]] = defaultdict(list)
-    for tile, (size, number) in enumerate(zip(sizes, numbers, strict=True)):
+    for tile, size in enumerate(sizes):
+        number = numbers[tile]
         if number > 0:
             alike[size, number].append(tile)
     for (size, _), tiles in alike.items():
@@ -95,7 +103,8 @@ def _stacked(
     sampler: Sampler, points: Points, tiles: list[Rows], channels: Tensor | None
 ) -> Tensor:
     """Return tiles of one size ``(B, n, 3 + C)`` as the sampler takes them."""
-    places = torch.stack([_as_input(sampler, points[tile]) for tile in tiles])
+    inputs = [_as_input(sampler, points[tile]) for tile in tiles]
+    places = torch.stack(inputs)
     if channels is None:
         return places
     of_tiles = [channels[torch.from_numpy(tile)] for tile in tiles]
@@ -153,8 +162,9 @@ def shares(m: int, sizes: list[int]) -> Rows:
 def sample_tiles(sampler: Sampler, tiles: Tensor, m: int) -> Rows:
     """Return m different rows ``(B, m)`` of every tile ``(B, n, 3)``."""
     if m == tiles.shape[1]:
-        return np.broadcast_to(np.arange(m), (len(tiles), m))
-    rows = sampler.select("completed", tiles, m)[1]
+        everything = np.arange(m)
+        return np.broadcast_to(everything, (len(tiles), m))
+    _, rows = sampler.select("completed", tiles, m)
     assert rows is not None
     return rows.numpy()
 
@@ -172,11 +182,14 @@ def thin(points: Points, m: int) -> Rows:
     excess = len(points) - m
     if not excess:
         return np.arange(m)
-    nearest: Any = cKDTree(points).query(points, k=min(NEIGHBOURS + 1, len(points)))
+    tree = cKDTree(points)
+    nearest: Any = tree.query(points, k=min(NEIGHBOURS + 1, len(points)))
     distance, other = nearest
-    rows, column = (other != np.arange(len(points))[:, None]).nonzero()
+    own = np.arange(len(points))[:, None]
+    rows, column = (other != own).nonzero()
     nearest_first = distance[rows, column].argsort(kind="stable")
-    pairs = np.stack([rows, other[rows, column]], 1)[nearest_first]
+    all_pairs = np.stack([rows, other[rows, column]], 1)
+    pairs = all_pairs[nearest_first]
     remains = np.ones(len(points), bool)
     for row, neighbour in pairs.tolist():
         if not excess:

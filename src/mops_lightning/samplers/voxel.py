@@ -12,7 +12,8 @@ from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.ordering import compiled_hashes, seeded_order
 from mops_lightning.types import SampleOutput
 
-COARSEST, FINEST = -1.0, 20.0
+COARSEST = -1.0
+FINEST = 20.0
 """Range of log₂(side of the cloud / side of a voxel): one voxel, and the precision of float32."""
 BISECTIONS = 24
 """Bisection steps; the relative error of the voxel size is about one in a million."""
@@ -55,7 +56,8 @@ class VoxelSampler(Sampler):
         for row, chosen in zip(rows, fullest, strict=True):
             row[: len(chosen)] = chosen
         indices = torch.from_numpy(rows).to(points.device)
-        counts = torch.tensor([len(chosen) for chosen in fullest], device=points.device)
+        numbers = [len(chosen) for chosen in fullest]
+        counts = torch.tensor(numbers, device=points.device)
         if int(counts.min()) < m:
             indices = _filled(detached, indices, counts)
         return SampleOutput(gather_points(points, indices), indices, {})
@@ -64,10 +66,10 @@ class VoxelSampler(Sampler):
 def _filled(points: Tensor, indices: Tensor, counts: Tensor) -> Tensor:
     """Fill up by farthest point sampling, whose ties do not depend on the input order."""
     order = seeded_order(points, seed=0)
-    places = torch.empty_like(order).scatter_(
-        1, order, torch.arange(points.shape[1], device=points.device).expand_as(order)
-    )
-    filled = farthest_point_fill(gather_points(points, order), places.gather(1, indices), counts)
+    numbers = torch.arange(points.shape[1], device=points.device)
+    places = torch.empty_like(order).scatter_(1, order, numbers.expand_as(order))
+    ordered = gather_points(points, order)
+    filled = farthest_point_fill(ordered, places.gather(1, indices), counts)
     return order.gather(1, filled)
 
 
@@ -88,7 +90,8 @@ def fullest_voxels(points: Tensor, m: int) -> list[NDArray[np.int64]]:
     hashes = compiled_hashes(on_cpu, 0).view(np.int64)
     spans = _spans(on_cpu)
     scales = [_scale(cloud, m) for cloud in spans]
-    return [_fullest(*cloud) for cloud in zip(exact, spans, scales, hashes, strict=True)]
+    clouds = zip(exact, spans, scales, hashes, strict=True)
+    return [_fullest(*cloud) for cloud in clouds]
 
 
 def _fullest(
@@ -100,13 +103,15 @@ def _fullest(
     cell_of, keys = voxel_search.group(spans, scale)
     bits = 61 - len(points).bit_length()
     counts, rows = voxel_search.nearest_to_means(points.ravel(), cell_of, len(keys), hashes, bits)
-    fullest: NDArray[np.int64] = rows[np.lexsort((keys, -counts))]
+    order = np.lexsort((keys, -counts))
+    fullest: NDArray[np.int64] = rows[order]
     return fullest
 
 
 def _spans(points: Tensor) -> list[Positions]:
     """Return the positions ``(3·N,)`` of the points of every cloud in the unit cube around it."""
-    exact = points.to(torch.promote_types(points.dtype, torch.float32)).contiguous().numpy()
+    dtype = torch.promote_types(points.dtype, torch.float32)
+    exact = points.to(dtype).contiguous().numpy()
     tiny = np.finfo(exact.dtype).tiny
     return [voxel_search.in_unit_cube(cloud.ravel(), tiny) for cloud in exact]
 
@@ -119,7 +124,8 @@ def _scale(spans: Positions, m: int) -> np.floating:
         m: smallest number of voxels.
     """
     search = _Search(spans, m)
-    coarse, fine = spans.dtype.type(COARSEST), spans.dtype.type(FINEST)
+    coarse = spans.dtype.type(COARSEST)
+    fine = spans.dtype.type(FINEST)
     for _ in range(BISECTIONS):
         middle = (coarse + fine) / 2
         if search.reaches(_power_of_two(middle)):
@@ -172,7 +178,8 @@ class _Search:
         voxels_of_cube = (int(scale) + 1) ** 3
         if voxels_of_cube < self.m:
             return False
-        return bool(voxel_search.reaches(self.moving, scale, self.wanted, self.settled, self.shift))
+        has_wanted = voxel_search.reaches(self.moving, scale, self.wanted, self.settled, self.shift)
+        return bool(has_wanted)
 
     def _settle(self) -> None:
         self.moving, entered = voxel_search.settle(
