@@ -45,11 +45,13 @@ class Cloud(NamedTuple):
 
     def mapped(self, matrix: Tensor) -> "Cloud":
         """Return the points times an invertible matrix; normals stay normal."""
-        return self._replace(points=self.channels.mapped(self.points, matrix))
+        mapped = self.channels.mapped(self.points, matrix)
+        return self._replace(points=mapped)
 
     def normalised(self) -> "Cloud":
         """Return the points in the unit sphere."""
-        return self.at(normalize_unit_sphere(self.places[None])[0])
+        normalised = normalize_unit_sphere(self.places[None])
+        return self.at(normalised[0])
 
     def without(self, rows: Tensor) -> "Cloud":
         """Return the points that are not in ``rows``."""
@@ -61,12 +63,16 @@ class Cloud(NamedTuple):
         """Return the points and further ones, which have the channels of random points."""
         added = places
         if self.channels:
-            rows = torch.randint(len(self.points), (len(places),), generator=rng)
-            added = torch.cat([places, self.points[rows, 3:]], 1)
+            number = len(places)
+            rows = torch.randint(len(self.points), (number,), generator=rng)
+            channels = self.points[rows, 3:]
+            added = torch.cat([places, channels], 1)
         return self._replace(points=torch.cat([self.points, added]))
 
 
 Corruption = Callable[[Cloud, float, torch.Generator], Cloud]
+Levels = tuple[float, float, float, float, float]
+SEVERITIES = ("1", "2", "3", "4", "5")
 """Corrupts a cloud at a level; the number of points returned depends on both only."""
 
 
@@ -93,7 +99,8 @@ def corrupt(clouds: Clouds, spec: str, channels: PointChannels = NO_CHANNELS) ->
         )
     corrupted = []
     for number, points in enumerate(clouds.points):
-        cloud = apply(Cloud(points, channels), level, generator(STREAM, number))
+        rng = generator(STREAM, number)
+        cloud = apply(Cloud(points, channels), level, rng)
         corrupted.append(cloud.points)
     stacked = torch.stack(corrupted)
     parts = None
@@ -105,9 +112,10 @@ def corrupt(clouds: Clouds, spec: str, channels: PointChannels = NO_CHANNELS) ->
 def parse(spec: str) -> tuple[Corruption, float]:
     """Return the function and the level of ``KIND-SEVERITY``."""
     kind, _, severity = spec.rpartition("-")
-    if kind not in KINDS or severity not in ("1", "2", "3", "4", "5"):
-        is_known = kind in KINDS or spec in KINDS
-        hint = "" if is_known else did_you_mean(kind or spec, KINDS)
+    if kind not in KINDS or severity not in SEVERITIES:
+        hint = ""
+        if kind not in KINDS and spec not in KINDS:
+            hint = did_you_mean(kind or spec, KINDS)
         raise UserError(
             "test_corruption must be a kind with a severity of 1 to 5, such as shear-3, got "
             f"{spec!r}.{hint}"
@@ -119,14 +127,17 @@ def parse(spec: str) -> tuple[Corruption, float]:
 def jitter(cloud: Cloud, std: float, rng: torch.Generator) -> Cloud:
     """Add Gaussian noise to every coordinate."""
     places = cloud.places
-    return cloud.at(places + std * torch.randn(places.shape, generator=rng))
+    noise = torch.randn(places.shape, generator=rng)
+    return cloud.at(places + std * noise)
 
 
 def rotation(cloud: Cloud, degrees: float, rng: torch.Generator) -> Cloud:
     """Rotate by an angle of up to ``degrees`` about a random axis."""
     axis = normalize(torch.randn(3, generator=rng), dim=0)
-    half = math.radians(degrees) * _uniform((1,), rng) / 2
-    quaternion = torch.cat([half.cos(), half.sin() * axis])
+    angle = math.radians(degrees) * _uniform((1,), rng)
+    half = angle / 2
+    vector = half.sin() * axis
+    quaternion = torch.cat([half.cos(), vector])
     return cloud.mapped(quaternion_to_matrix(quaternion))
 
 
@@ -140,15 +151,18 @@ def scaling(cloud: Cloud, factor: float, rng: torch.Generator) -> Cloud:
 def shear(cloud: Cloud, amount: float, rng: torch.Generator) -> Cloud:
     """Add multiples of the other coordinates, up to ``amount``, to every coordinate."""
     mixed = amount * _uniform((3, 3), rng)
-    return cloud.mapped(torch.eye(3) + mixed.fill_diagonal_(0)).normalised()
+    matrix = torch.eye(3) + mixed.fill_diagonal_(0)
+    return cloud.mapped(matrix).normalised()
 
 
 def distortion(cloud: Cloud, amount: float, rng: torch.Generator) -> Cloud:
     """Move the nodes of a lattice of 5 x 5 x 5 by up to ``amount``, and the points with them."""
     lattice = amount * _uniform((1, 3, 5, 5, 5), rng)
     places = cloud.places
-    moved = grid_sample(lattice, places[None, None, None], align_corners=True)
-    return cloud.at(places + moved[0, :, 0, 0].T).normalised()
+    grid = places[None, None, None]
+    offsets = grid_sample(lattice, grid, align_corners=True)
+    moved = places + offsets[0, :, 0, 0].T
+    return cloud.at(moved).normalised()
 
 
 def density_down(cloud: Cloud, places: float, rng: torch.Generator) -> Cloud:
@@ -179,29 +193,35 @@ def cutout(cloud: Cloud, holes: float, rng: torch.Generator) -> Cloud:
     """Cut ``holes`` holes of three percent of the points each."""
     size = round(0.03 * len(cloud.points))
     for _ in range(int(holes)):
-        cloud = cloud.without(_nearest(cloud, size, rng))
+        near = _nearest(cloud, size, rng)
+        cloud = cloud.without(near)
     return cloud
 
 
 def drop_global(cloud: Cloud, share: float, rng: torch.Generator) -> Cloud:
     """Drop a share of the points at random."""
     number = len(cloud.points)
+    number_gone = round(share * number)
     order = torch.randperm(number, generator=rng)
-    return cloud.without(order[: round(share * number)])
+    return cloud.without(order[:number_gone])
 
 
 def drop_local(cloud: Cloud, share: float, rng: torch.Generator) -> Cloud:
     """Drop a share of the points around one to eight places."""
-    for size in _split(round(share * len(cloud.points)), rng):
-        cloud = cloud.without(_nearest(cloud, size, rng))
+    number_gone = round(share * len(cloud.points))
+    for size in _split(number_gone, rng):
+        near = _nearest(cloud, size, rng)
+        cloud = cloud.without(near)
     return cloud
 
 
 def add_global(cloud: Cloud, share: float, rng: torch.Generator) -> Cloud:
     """Add points that are uniform in the unit ball; ``share`` is relative to the cloud."""
     count = round(share * len(cloud.points))
-    direction = normalize(torch.randn(count, 3, generator=rng), dim=1)
-    radius = torch.rand(count, 1, generator=rng) ** (1 / 3)
+    vectors = torch.randn(count, 3, generator=rng)
+    direction = normalize(vectors, dim=1)
+    volume = torch.rand(count, 1, generator=rng)
+    radius = volume ** (1 / 3)
     return cloud.followed_by(radius * direction, rng)
 
 
@@ -221,10 +241,11 @@ def add_local(cloud: Cloud, share: float, rng: torch.Generator) -> Cloud:
 def background(cloud: Cloud, share: float, rng: torch.Generator) -> Cloud:
     """Add points that are uniform in the cube from -1 to 1."""
     count = round(share * len(cloud.points))
-    return cloud.followed_by(_uniform((count, 3), rng), rng)
+    places = _uniform((count, 3), rng)
+    return cloud.followed_by(places, rng)
 
 
-KINDS: dict[str, tuple[Corruption, tuple[float, float, float, float, float]]] = {
+KINDS: dict[str, tuple[Corruption, Levels]] = {
     "jitter": (jitter, (0.01, 0.02, 0.03, 0.04, 0.05)),
     "rotation": (rotation, (15, 30, 60, 90, 180)),
     "scaling": (scaling, (1.6, 1.7, 1.8, 1.9, 2.0)),
@@ -244,7 +265,8 @@ KINDS: dict[str, tuple[Corruption, tuple[float, float, float, float, float]]] = 
 
 def _uniform(shape: tuple[int, ...], rng: torch.Generator) -> Tensor:
     """Draw from -1 to 1."""
-    return 2 * torch.rand(shape, generator=rng) - 1
+    numbers = torch.rand(shape, generator=rng)
+    return 2 * numbers - 1
 
 
 def _nearest(cloud: Cloud, size: int, rng: torch.Generator) -> Tensor:

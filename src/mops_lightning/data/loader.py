@@ -59,27 +59,38 @@ class Augmentation:
         """
         if self.rotate_up:
             angle = torch.rand(len(points), generator=rng) * (2 * torch.pi)
-            cos = angle.cos()
-            sin = angle.sin()
-            zero = torch.zeros_like(angle)
-            rows = [cos, zero, sin, zero, zero + 1, zero, -sin, zero, cos]
-            # These matrices are for y; moved along the diagonal, they are for another axis.
-            up = self.rotate_up if isinstance(self.rotate_up, str) else "y"
-            shift = AXES.index(up) - AXES.index("y")
-            matrix = torch.stack(rows, 1).view(-1, 3, 3).roll((shift, shift), (1, 2))
+            matrix = self._rotations(angle)
             points = channels.rotated(points, matrix)
         if self.jitter:
             most = JITTER_CLIP * self.jitter
             places = coordinates(points)
             noise = torch.randn(places.shape, generator=rng).mul_(self.jitter)
-            points = with_coordinates(points, places + noise.clamp_(-most, most))
+            noise = noise.clamp_(-most, most)
+            points = with_coordinates(points, places + noise)
         if self.stretch > 1 or self.shift:
             scale, offset = torch.rand(2, len(points), 1, 3, generator=rng)
             least = 1 / self.stretch
-            points = channels.stretched(points, least + (self.stretch - least) * scale)
-            moved = coordinates(points) + self.shift * (2 * offset - 1)
+            factors = least + (self.stretch - least) * scale
+            points = channels.stretched(points, factors)
+            shifts = self.shift * (2 * offset - 1)
+            moved = coordinates(points) + shifts
             points = with_coordinates(points, moved)
         return points
+
+    def _rotations(self, angle: Tensor) -> Tensor:
+        """Return matrices ``(B, 3, 3)`` of rotations about the vertical axis."""
+        cos = angle.cos()
+        sin = angle.sin()
+        zero = torch.zeros_like(angle)
+        one = zero + 1
+        rows = [cos, zero, sin, zero, one, zero, -sin, zero, cos]
+        matrix = torch.stack(rows, 1).view(-1, 3, 3)
+        # These matrices are for y; moved along the diagonal, they are for another axis.
+        up = "y"
+        if isinstance(self.rotate_up, str):
+            up = self.rotate_up
+        shift = AXES.index(up) - AXES.index("y")
+        return matrix.roll((shift, shift), (1, 2))
 
 
 FIXED = 11
@@ -135,8 +146,13 @@ class CloudLoader:
         if self.clouds.sizes is not None and not self.shuffle:
             self.batch_size = 1
         full, rest = divmod(len(self.clouds.points), self.batch_size)
-        self.batches = full if self.drop_last and full else full + bool(rest)
-        self.epoch = self.position = self.resume_at = 0
+        self.batches = full
+        leaves_out_rest = self.drop_last and full > 0
+        if rest and not leaves_out_rest:
+            self.batches += 1
+        self.epoch = 0
+        self.position = 0
+        self.resume_at = 0
 
     def __len__(self) -> int:
         return self.batches
@@ -145,7 +161,8 @@ class CloudLoader:
     def keeps_clouds(self) -> bool:
         """Whether the clouds are the same in every epoch, neither augmented nor converted."""
         is_fixed = self.clouds.sizes is None or not self.shuffle
-        return is_fixed and self.make_batch is None and self.augment in (None, Augmentation())
+        is_augmented = self.augment not in (None, Augmentation())
+        return is_fixed and self.make_batch is None and not is_augmented
 
     def set_epoch(self, epoch: int) -> None:
         """Start ``epoch`` from its first batch, unless it is the current epoch."""
@@ -170,34 +187,53 @@ class CloudLoader:
         start = self.resume_at
         self.resume_at = 0
         if self.shuffle:
-            order = torch.randperm(number, generator=generator(self.seed, epoch))
+            rng = generator(self.seed, epoch)
+            order = torch.randperm(number, generator=rng)
             if self.clouds.sizes is not None:
                 order = _similar_together(order, self.clouds.sizes, self.batch_size)
         else:
             order = torch.arange(number)
-        for batch, (chosen, mine) in enumerate(self._cut(order)[start:], start):
-            points, parts = self._points(chosen, generator(DENSITY, self.seed, epoch, batch))
+        batches = self._cut(order)[start:]
+        for batch, (chosen, mine) in enumerate(batches, start):
+            rng_of_density = generator(DENSITY, self.seed, epoch, batch)
+            points, parts = self._points(chosen, rng_of_density)
             if self.augment is not None:  # the full batch, which shares one generator
                 rng = generator(self.seed, epoch, batch)
                 points = self.augment(points, rng, self.channels)
-            last = batch + 1 == self.batches
-            self.epoch, self.position = (epoch + 1, 0) if last else (epoch, batch + 1)
-            parts = None if parts is None else parts[mine]
+            self._advance(epoch, batch)
+            if parts is not None:
+                parts = parts[mine]
             yield self._made(points[mine], parts, chosen[mine], epoch)
+
+    def _advance(self, epoch: int, batch: int) -> None:
+        """Note that a batch was made: the next one may begin a new epoch."""
+        is_last = batch + 1 == self.batches
+        if is_last:
+            self.epoch = epoch + 1
+            self.position = 0
+        else:
+            self.epoch = epoch
+            self.position = batch + 1
 
     def _points(self, rows: Tensor, rng: Generator) -> tuple[Tensor, Tensor | None]:
         """Return the points of clouds, as many as the smallest of them has, and their parts."""
         clouds = self.clouds.take(rows)
-        points, parts = clouds.points, clouds.parts
+        points = clouds.points
+        parts = clouds.parts
         if clouds.sizes is None:
             return points, parts
         number = clouds.smallest[1]
         # The smallest of random numbers, which are infinite for rows that repeat a cloud.
         drawn = torch.rand(points.shape[:2], generator=rng)
-        drawn[torch.arange(points.shape[1]) >= clouds.sizes[:, None]] = torch.inf
-        kept = drawn.topk(number, largest=False).indices.sort(1).values
+        place = torch.arange(points.shape[1])
+        is_repeat = place >= clouds.sizes[:, None]
+        drawn[is_repeat] = torch.inf
+        smallest = drawn.topk(number, largest=False).indices
+        kept = smallest.sort(1).values
         points = gather_points(points, kept)
-        return points, None if parts is None else parts.gather(1, kept)
+        if parts is not None:
+            parts = parts.gather(1, kept)
+        return points, parts
 
     def _cut(self, order: Tensor) -> list[tuple[Tensor, slice]]:
         """Return the rows of every batch, and the slice of them that belongs to this process."""
@@ -205,25 +241,30 @@ class CloudLoader:
         if processes > 1 and not self.shuffle:
             # Shares differ by at most one cloud; all processes have the same number of batches.
             own = order.tensor_split(processes)[rank]
-            return [(rows, slice(None)) for rows in own.tensor_split(self.batches)]
+            everything = slice(None)
+            return [(rows, everything) for rows in own.tensor_split(self.batches)]
         size = self.batch_size
-        cut = [order[batch * size : (batch + 1) * size] for batch in range(self.batches)]
-        shares = [len(rows) // processes for rows in cut]
-        return [
-            (rows, slice(rank * share, (rank + 1) * share))
-            for rows, share in zip(cut, shares, strict=True)
-        ]
+        cut = []
+        for batch in range(self.batches):
+            rows = order[batch * size : (batch + 1) * size]
+            share = len(rows) // processes
+            cut.append((rows, slice(rank * share, (rank + 1) * share)))
+        return cut
 
     def batch_of(self, rows: Tensor) -> Any:
         """Return the clouds with the rows ``(B,)`` as a batch; for loaders without shuffle."""
-        points, parts = self._points(rows, generator(DENSITY, self.seed))
+        rng = generator(DENSITY, self.seed)
+        points, parts = self._points(rows, rng)
         return self._made(points, parts, rows, 0)
 
     def _made(self, points: Tensor, parts: Tensor | None, rows: Tensor, epoch: int) -> Any:
         if self.make_batch is None:
             return Batch(points, self.clouds.labels[rows], rows, parts)
-        stream = (DRAWN, self.seed, epoch) if self.shuffle else (FIXED, self.seed)
-        return self.make_batch(points, [generator(*stream, row) for row in rows.tolist()])
+        stream: tuple[int, ...] = (FIXED, self.seed)
+        if self.shuffle:
+            stream = (DRAWN, self.seed, epoch)
+        generators = [generator(*stream, row) for row in rows.tolist()]
+        return self.make_batch(points, generators)
 
 
 def _similar_together(order: Tensor, sizes: Tensor, batch_size: int) -> Tensor:
@@ -231,5 +272,8 @@ def _similar_together(order: Tensor, sizes: Tensor, batch_size: int) -> Tensor:
 
     Clouds of ``WINDOW`` batches at a time are sorted by size.
     """
-    windows = [rows[sizes[rows].argsort(stable=True)] for rows in order.split(WINDOW * batch_size)]
+    windows = []
+    for rows in order.split(WINDOW * batch_size):
+        by_size = sizes[rows].argsort(stable=True)
+        windows.append(rows[by_size])
     return torch.cat(windows)

@@ -244,7 +244,6 @@ def ranks_of(planes, channels, largest, word, in_sphere, distinct):
     sphere = np.empty(0)
     if in_sphere:
         sphere = np.empty(channels + 1)
-    if in_sphere:
         measure_sphere(planes, channels, largest, sphere)
     write_keys(planes, channels, word, sphere, keys)
     if distinct:

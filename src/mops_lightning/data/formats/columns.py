@@ -28,14 +28,17 @@ def from_columns(columns: Mapping[str, Column], path: Path, layout: Any = None) 
     Raises:
         BadCloudError: there are no coordinates, or float64 does not hold them.
     """
-    name_of = {name.lower(): name for name in reversed(list(columns))}
+    names_from_last = reversed(list(columns))
+    name_of = {name.lower(): name for name in names_from_last}
     if not {"x", "y", "z"} <= name_of.keys():
-        raise BadCloudError(f"{path} must have columns x, y and z, got {', '.join(columns)}.")
+        given = ", ".join(columns)
+        raise BadCloudError(f"{path} must have columns x, y and z, got {given}.")
     axes = [name_of["x"], name_of["y"], name_of["z"]]
     for name in axes:
         _check_coordinates(name, columns[name], path)
-    points = np.stack([np.asarray(columns[name], np.float64) for name in axes], 1)
-    kind = np.result_type(*(columns[name].dtype for name in axes))
+    coordinates = [np.asarray(columns[name], np.float64) for name in axes]
+    points = np.stack(coordinates, 1)
+    kinds = [columns[name].dtype for name in axes]
     attributes: dict[str, Column] = {}
     left_out = []
     for name, column in columns.items():
@@ -45,12 +48,14 @@ def from_columns(columns: Mapping[str, Column], path: Path, layout: Any = None) 
             attributes[name] = in_native_order(column)
         else:
             left_out.append(name)
-    return Table(points, attributes, form=Form(kind, left_out=tuple(left_out), layout=layout))
+    form = Form(np.result_type(*kinds), left_out=tuple(left_out), layout=layout)
+    return Table(points, attributes, form=form)
 
 
 def _check_coordinates(name: str, column: Column, path: Path) -> None:
-    if column.dtype.kind not in "fiu":
-        raise BadCloudError(f"{path}: {name} must be numbers, got {column.dtype}.")
+    kind = column.dtype
+    if kind.kind not in "fiu":
+        raise BadCloudError(f"{path}: {name} must be numbers, got {kind}.")
     if not holds_exactly(np.dtype(np.float64), column):
         raise BadCloudError(f"{path}: {name} has numbers that float64 does not hold exactly.")
 
@@ -62,15 +67,18 @@ def is_number_column(column: Column) -> bool:
 
 def in_native_order(column: Column) -> Column:
     """Return a column in the byte order of this machine: torch reads no other."""
-    return column.astype(column.dtype.newbyteorder("="), copy=False)
+    native = column.dtype.newbyteorder("=")
+    return column.astype(native, copy=False)
 
 
 def from_array(array: NDArray[Any], path: Path, layout: Any = None) -> Table:
     """Make a table of the columns of an array; see ``column_names``."""
     names = column_names(array, path)
     if array.dtype.names:
-        return from_columns({name: array[name] for name in names}, path, layout)
-    return from_columns(dict(zip(names, array.T, strict=True)), path, layout)
+        columns = {name: array[name] for name in names}
+    else:
+        columns = dict(zip(names, array.T, strict=True))
+    return from_columns(columns, path, layout)
 
 
 def column_names(array: NDArray[Any], path: Path) -> list[str]:
@@ -85,28 +93,31 @@ def column_names(array: NDArray[Any], path: Path) -> list[str]:
             per point.
     """
     shape = array.shape
-    if array.dtype.names:
+    kind = array.dtype
+    if kind.names:
         if array.ndim != 1:
             raise BadCloudError(f"{path} must hold one row of fields per point, got {shape}.")
-        return list(array.dtype.names)
+        return list(kind.names)
     is_rows = len(shape) == 2 and shape[1] >= 3
-    if not is_rows or array.dtype.kind not in "fiu":
-        raise BadCloudError(f"{path} must hold rows of x, y, z, got {array.dtype} {shape}.")
+    if not is_rows or kind.kind not in "fiu":
+        raise BadCloudError(f"{path} must hold rows of x, y, z, got {kind} {shape}.")
     return unnamed(shape[1])
 
 
 def unnamed(number: int) -> list[str]:
     """Return the names of columns without names: x, y, z, column_3 and so on."""
-    return ["x", "y", "z", *(f"column_{column}" for column in range(3, number))]
+    others = [f"column_{column}" for column in range(3, number)]
+    return ["x", "y", "z", *others]
 
 
 def split_array(name: str, values: NDArray[Any]) -> dict[str, Column]:
     """Return values ``(N,)`` or ``(N, 1)`` as one column, ``(N, k)`` as ``NAME_0`` and so on."""
     if values.ndim == 1:
         return {name: values}
-    if values.shape[1] == 1:
+    number = values.shape[1]
+    if number == 1:
         return {name: values[:, 0]}
-    return {f"{name}_{place}": values[:, place] for place in range(values.shape[1])}
+    return {f"{name}_{place}": values[:, place] for place in range(number)}
 
 
 def unique_names(table: Table) -> dict[str, Column]:
@@ -125,16 +136,21 @@ def holds_exactly(kind: np.dtype[Any], column: Column) -> bool:
     if not len(column) or column.dtype.kind == "b":
         return True
     if column.dtype.kind == "f":
-        return np.can_cast(column.dtype, kind) or changed_numbers(column, kind) == 0
+        if np.can_cast(column.dtype, kind):
+            return True
+        return changed_numbers(column, kind) == 0
     least, most = _whole_numbers_of(kind)
     # Compared as Python's integers, which do not overflow.
-    return least <= int(column.min()) and int(column.max()) <= most
+    smallest = int(column.min())
+    largest = int(column.max())
+    return least <= smallest and largest <= most
 
 
 def _whole_numbers_of(kind: np.dtype[Any]) -> tuple[int, int]:
     """Return the smallest and largest number between which a data type holds all whole ones."""
     if kind.kind == "f":  # numpy calls every cast from int64 to float64 safe
-        most = min(LARGEST_WHOLE, 2 ** (np.finfo(kind).nmant + 1))
+        bits = np.finfo(kind).nmant + 1
+        most = min(LARGEST_WHOLE, 2**bits)
         return -most, most
     limits = np.iinfo(kind)
     return limits.min, limits.max
@@ -146,7 +162,8 @@ def changed_numbers(column: Column, kind: np.dtype[Any]) -> int:
         back = column.astype(kind).astype(column.dtype)
     same = back == column
     if column.dtype.kind == "f":
-        same |= np.isnan(column) & np.isnan(back)
+        is_still_nan = np.isnan(column) & np.isnan(back)
+        same |= is_still_nan
     return int((~same).sum())
 
 
@@ -183,9 +200,10 @@ def fitting_type(name: str, column: Column, allowed: Iterable[str], suffix: str)
     if own.kind == "f":  # longdouble, with more digits than any format has
         return np.dtype(np.float64)
     others = [other for other in (".npz", ".las") if other != suffix]
+    formats = " or ".join(others)
     raise CannotHoldError(
         f"{suffix} has no type for {name!r}, whole numbers of 64 bits up to "
-        f"{int(column.max())}. Write {' or '.join(others)}, or leave all columns out by "
+        f"{int(column.max())}. Write {formats}, or leave all columns out by "
         "--coordinates-only."
     )
 
@@ -199,7 +217,9 @@ def floating(kind: np.dtype[Any]) -> np.dtype[Any]:
 
 def to_rows(columns: Mapping[str, Column]) -> NDArray[Any]:
     """Return columns ``(N,)`` as a structured array of N rows, in little-endian order."""
-    fields = [(name, column.dtype.newbyteorder("<")) for name, column in columns.items()]
+    fields = []
+    for name, column in columns.items():
+        fields.append((name, column.dtype.newbyteorder("<")))
     first = next(iter(columns.values()))
     rows = np.empty(len(first), fields)
     for name, column in columns.items():

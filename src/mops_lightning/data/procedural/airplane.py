@@ -36,9 +36,14 @@ def airplane(rng: Generator) -> Trimesh:
         parts += _engine(rng, radius * 1.35, radius * 0.45, -0.45, size)
         return join(parts)
     has_two_engines = rng.random() < 0.65
-    for share in (0.36,) if has_two_engines else (0.3, 0.58):
+    shares = [0.3, 0.58]
+    if has_two_engines:
+        shares = [0.36]
+    y = wings.level - size * 1.3
+    for share in shares:
+        x = share * wings.span
         edge = wings.root_z - wings.sweep * share * wings.span
-        parts += _engine(rng, share * wings.span, wings.level - size * 1.3, edge, size)
+        parts += _engine(rng, x, y, edge, size)
     return join(parts)
 
 
@@ -46,9 +51,10 @@ def _hull(radius: float) -> Trimesh:
     z = np.array((NOSE, NOSE - 0.05, NOSE - 0.2, NOSE - 0.4, TAIL * 0.35, TAIL * 0.8, TAIL))
     y = radius * np.array((-0.3, -0.2, -0.05, 0, 0, 0.4, 0.75))
     wide = radius * np.array((0.12, 0.45, 0.85, 1, 1, 0.55, 0.15))
-    body = smooth(np.column_stack((y, z, wide)), 24)
-    path = np.column_stack((np.zeros(24), body[:, 0], body[:, 1]))
-    return tube(path, body[:, 2], 20, across=(1, 0, 0))
+    profile = np.column_stack((y, z, wide))
+    body_y, body_z, body_radii = smooth(profile, 24).T
+    path = np.column_stack((np.zeros(24), body_y, body_z))
+    return tube(path, body_radii, 20, across=(1, 0, 0))
 
 
 @dataclass
@@ -88,13 +94,16 @@ class _Wings:
         root_chord = rng.uniform(0.3, 0.5)
         tip_chord = root_chord * rng.uniform(0.3, widest_tip)
         is_high = has_propeller and rng.random() < 0.6
+        level = radius * -0.5
+        if is_high:
+            level = radius * 0.8
         return cls(
             radius=radius,
             span=span,
             sweep=sweep,
             root_chord=root_chord,
             tip_chord=tip_chord,
-            level=radius * (0.8 if is_high else -0.5),
+            level=level,
             dihedral=rng.uniform(0.0, 0.12),
             root_z=rng.uniform(0.1, 0.4),
         )
@@ -103,13 +112,18 @@ class _Wings:
         """Return the left wing, for -1, or the right one, for 1."""
         tip_y = self.level + self.dihedral * self.span
         tip_z = self.root_z - self.sweep * self.span
-        root = np.array((side * self.radius * 0.5, self.level, self.root_z))
+        root_x = side * self.radius * 0.5
+        root = np.array((root_x, self.level, self.root_z))
         tip = np.array((side * self.span, tip_y, tip_z))
         return _wing(root, tip, self.root_chord, self.tip_chord)
 
 
 def _tail(
-    radius: float, tall: float, back: float, half: float, has_high_tailplane: bool
+    radius: float,
+    tall: float,
+    back: float,
+    half: float,
+    has_high_tailplane: bool,
 ) -> list[Trimesh]:
     """Return the fin and both halves of the tailplane.
 
@@ -121,7 +135,8 @@ def _tail(
         has_high_tailplane: whether it is at the top of the fin.
     """
     rear = TAIL + 0.32
-    top = np.array((0, radius * 0.5 + tall, rear - back))
+    top_y = radius * 0.5 + tall
+    top = np.array((0, top_y, rear - back))
     foot = np.array((0, radius * 0.3, rear))
     parts = [_wing(foot, top, 0.32, 0.16, upright=True)]
     root = np.array((0, radius * 0.5, rear - 0.05))
@@ -129,13 +144,18 @@ def _tail(
         root = top
     _, y, z = root
     for side in (-1, 1):
-        tip = np.array((side * half, y + 0.02, z - back * half / 0.4))
+        tip_z = z - back * half / 0.4
+        tip = np.array((side * half, y + 0.02, tip_z))
         parts.append(_wing(root, tip, 0.24, 0.12))
     return parts
 
 
 def _wing(
-    root: Array, tip: Array, root_chord: float, tip_chord: float, upright: bool = False
+    root: Array,
+    tip: Array,
+    root_chord: float,
+    tip_chord: float,
+    upright: bool = False,
 ) -> Trimesh:
     """Return a flat wing between the leading edges at its root and tip."""
     chord = (0, -0.25, -0.6, -1, -0.6, -0.25)
@@ -145,19 +165,24 @@ def _wing(
         shape = np.column_stack((rise, level, chord))
     else:
         shape = np.column_stack((level, rise, chord))
-    return loft((root + root_chord * shape, tip + tip_chord * shape))
+    root_ring = root + root_chord * shape
+    tip_ring = tip + tip_chord * shape
+    return loft((root_ring, tip_ring))
 
 
 def _propeller(rng: Generator, nose: float, y: float) -> list[Trimesh]:
     blades = int(rng.integers(2, 5))
     start = rng.uniform(0, np.pi)
     hub = np.array((0, y, nose + 0.03))
-    parts = [rod((0, y, nose - 0.03), (0, y, nose + 0.08), (0.05, 0.015))]
+    rear_of_hub = (0, y, nose - 0.03)
+    front_of_hub = (0, y, nose + 0.08)
+    parts = [rod(rear_of_hub, front_of_hub, (0.05, 0.015))]
     turns = start + 2 * np.pi * np.arange(blades) / blades
     for turn in turns:
         out = np.array((np.cos(turn), np.sin(turn), 0))
         path = hub + np.outer((0.02, 0.12, 0.25), out)
-        parts.append(tube(path, (0.02, 0.035, 0.02), 8, across=(0, 0, 1), flatten=0.3))
+        blade = tube(path, (0.02, 0.035, 0.02), 8, across=(0, 0, 1), flatten=0.3)
+        parts.append(blade)
     return named("engine", *parts)
 
 
@@ -166,6 +191,7 @@ def _engine(rng: Generator, x: float, y: float, z: float, size: float) -> list[T
     long = rng.uniform(0.22, 0.32)
     front = z + long * 0.4
     rear = z - long * 0.6
-    left = rod((-x, y, front), (-x, y, rear), (size, size * 0.7), 14)
-    right = rod((x, y, front), (x, y, rear), (size, size * 0.7), 14)
+    radii = (size, size * 0.7)
+    left = rod((-x, y, front), (-x, y, rear), radii, 14)
+    right = rod((x, y, front), (x, y, rear), radii, 14)
     return named("engine", left, right)

@@ -25,14 +25,18 @@ def bed(rng: Generator) -> Trimesh:
     top = foot + frame + rng.uniform(0.14, 0.28)
     head = top + rng.uniform(0.2, 0.7)
     z = around(length)
-    parts = named("frame", *_rails(width, (foot, foot + frame), z))
+    head_end, foot_end = z
+    y_frame = (foot, foot + frame)
+    parts = named("frame", *_rails(width, y_frame, z))
     parts += named("mattress", *_mattress(rng, width, z, foot, frame, top))
     parts += named("leg", *_bed_legs(width, z, foot))
-    parts += named("pillow", *_pillows(width, top, z[0] + 0.3))
-    parts += named("board", *_board(rng, width, (0.0, head), z[0] - 0.03))
+    parts += named("pillow", *_pillows(width, top, head_end + 0.3))
+    headboard = _board(rng, width, (0.0, head), head_end - 0.03)
+    parts += named("board", *headboard)
     if rng.random() < 0.45:
         low = (0.0, top + rng.uniform(0.0, 0.25))
-        parts += named("board", *_board(rng, width, low, z[1] + 0.05))
+        footboard = _board(rng, width, low, foot_end + 0.05)
+        parts += named("board", *footboard)
     elif rng.random() < 0.3:
         tall = top + rng.uniform(0.8, 1.1)
         parts += named("frame", *_four_posts(width, z, tall))
@@ -42,12 +46,18 @@ def bed(rng: Generator) -> Trimesh:
 # Rails instead of a box, and no mattress under the blanket: hidden surfaces get no points.
 def _rails(width: float, y: Span, z: Span) -> list[Trimesh]:
     parts = [box(around(width), y, around(0.06, at)) for at in z]
-    parts += [box(around(0.06, x), y, z) for x in around(width - 0.06)]
+    for x in around(width - 0.06):
+        parts.append(box(around(0.06, x), y, z))
     return parts
 
 
 def _mattress(
-    rng: Generator, width: float, z: Span, foot: float, frame: float, top: float
+    rng: Generator,
+    width: float,
+    z: Span,
+    foot: float,
+    frame: float,
+    top: float,
 ) -> list[Trimesh]:
     """Return a mattress, and a blanket over a part of it if there is one."""
     start, end = z
@@ -68,8 +78,9 @@ def _mattress(
 
 def _bed_legs(width: float, z: Span, foot: float) -> list[Trimesh]:
     parts = []
+    head_end, foot_end = z
     for x in (-width / 2 + 0.06, width / 2 - 0.06):
-        for at in (z[0] + 0.1, z[1] - 0.1):
+        for at in (head_end + 0.1, foot_end - 0.1):
             parts.append(post(x, at, foot + 0.02, 0.05, 4))
     return parts
 
@@ -83,7 +94,8 @@ def _pillows(width: float, top: float, z: float) -> list[Trimesh]:
         wide = min(0.62, width * 0.8)
         centres = [0.0]
     y = (top - 0.03, top + 0.11)
-    return [cushion(around(wide, x), y, around(0.38, z), 0.1) for x in centres]
+    depth = around(0.38, z)
+    return [cushion(around(wide, x), y, depth, 0.1) for x in centres]
 
 
 def _four_posts(width: float, z: Span, height: float) -> list[Trimesh]:
@@ -97,7 +109,13 @@ def _four_posts(width: float, z: Span, height: float) -> list[Trimesh]:
         (right, foot),
     ]
     parts = [post(x, at, height, 0.045, 8) for x, at in corners]
-    for start, end in ((0, 1), (1, 3), (3, 2), (2, 0)):
+    sides = (
+        (0, 1),
+        (1, 3),
+        (3, 2),
+        (2, 0),
+    )
+    for start, end in sides:
         x0, z0 = corners[start]
         x1, z1 = corners[end]
         parts.append(rod((x0, height, z0), (x1, height, z1), 0.035, 8))
@@ -109,10 +127,14 @@ def _board(rng: Generator, width: float, y: Span, z: float) -> list[Trimesh]:
     low, high = y
     is_panel = rng.random() < 0.6
     if is_panel:
-        return [box(around(width * 1.03), (low + 0.1, high), around(0.07, z))]
+        panel = box(around(width * 1.03), (low + 0.1, high), around(0.07, z))
+        return [panel]
     parts = [rod((x, low, z), (x, high, z), 0.045, 8) for x in around(width)]
-    parts.append(box(around(width), (high - 0.14, high - 0.04), around(0.05, z)))
-    slats = np.linspace(-width / 2, width / 2, rng.integers(7, 11))[1:-1]
-    for x in slats:
-        parts.append(rod((x, low + 0.2, z), (x, high - 0.1, z), 0.02, 6))
+    rail = (high - 0.14, high - 0.04)
+    parts.append(box(around(width), rail, around(0.05, z)))
+    slats = np.linspace(-width / 2, width / 2, rng.integers(7, 11))
+    for x in slats[1:-1]:
+        bottom = (x, low + 0.2, z)
+        top = (x, high - 0.1, z)
+        parts.append(rod(bottom, top, 0.02, 6))
     return parts

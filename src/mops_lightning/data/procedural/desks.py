@@ -21,7 +21,8 @@ def desk(rng: Generator) -> Trimesh:
     height = rng.uniform(0.7, 0.95)
     depth = rng.uniform(0.6, 0.9)
     under = height - rng.uniform(0.03, 0.06)
-    parts = [box(around(width), (under, height), around(depth))]
+    top = box(around(width), (under, height), around(depth))
+    parts = [top]
     block = width * rng.uniform(0.22, 0.32)
     sides_with_drawers = _sides_with_drawers(rng)
     if not sides_with_drawers:
@@ -35,10 +36,11 @@ def desk(rng: Generator) -> Trimesh:
             parts += _desk_support(rng, outer, depth, under)
     if rng.random() < 0.6:
         low = under * rng.uniform(0.3, 0.75)
-        parts.append(box(around(width * 0.94), (low, under), around(0.02, -depth * 0.42)))
+        rear = around(0.02, -depth * 0.42)
+        parts.append(box(around(width * 0.94), (low, under), rear))
     if rng.random() < 0.35:
-        top = height + rng.uniform(0.3, 0.6)
-        parts += _hutch(rng, width, (height, top), -depth / 2)
+        hutch_top = height + rng.uniform(0.3, 0.6)
+        parts += _hutch(rng, width, (height, hutch_top), -depth / 2)
     return join(parts)
 
 
@@ -56,8 +58,9 @@ def _flat_drawers(rng: Generator, width: float, depth: float, under: float) -> l
     """Return two drawers under the whole top."""
     y = (under - rng.uniform(0.1, 0.16), under)
     z = around(depth * 0.85)
-    left = _drawers(around(width * 0.46, -width / 4), y, z, 1)
-    right = _drawers(around(width * 0.46, width / 4), y, z, 1)
+    half = width * 0.46
+    left = _drawers(around(half, -width / 4), y, z, 1)
+    right = _drawers(around(half, width / 4), y, z, 1)
     return left + right
 
 
@@ -68,7 +71,8 @@ def _drawer_block(
     floor = under * rng.choice((0.08, 0.45))
     rows = int(rng.integers(2, 4))
     x = (min(outer, inner), max(outer, inner))
-    parts = _drawers(x, (floor, under), around(depth * 0.9), rows)
+    z = around(depth * 0.9)
+    parts = _drawers(x, (floor, under), z, rows)
     parts += _feet(outer, depth, floor)
     parts += _feet(inner, depth, floor)
     return parts
@@ -77,12 +81,14 @@ def _drawer_block(
 def _desk_support(rng: Generator, x: float, depth: float, under: float) -> list[Trimesh]:
     """Return the side of a desk without drawers: a panel or two legs."""
     if rng.random() < 0.5:
-        return [box(around(0.04, x), (0, under), around(depth * 0.9))]
+        side = box(around(0.04, x), (0, under), around(depth * 0.9))
+        return [side]
     return _feet(x, depth, under)
 
 
 def _feet(x: float, depth: float, height: float) -> list[Trimesh]:
-    return [post(x, z, height, 0.03, 4) for z in around(depth * 0.8)]
+    places = around(depth * 0.8)
+    return [post(x, z, height, 0.03, 4) for z in places]
 
 
 def _drawers(x: Span, y: Span, z: Span, rows: int) -> list[Trimesh]:
@@ -93,17 +99,21 @@ def _drawers(x: Span, y: Span, z: Span, rows: int) -> list[Trimesh]:
     parts = [box(x, y, z)]
     levels = np.linspace(bottom, top, rows + 1)
     for low, high in pairwise(levels):
-        face = (left + 0.02, right - 0.02), (low + 0.02, high - 0.02), around(0.04, front)
-        knob = around(0.12, middle), around(0.025, (low + high) / 2), around(0.1, front)
-        parts += [box(*face), box(*knob)]
+        level = (low + high) / 2
+        y_face = (low + 0.02, high - 0.02)
+        face = box((left + 0.02, right - 0.02), y_face, around(0.04, front))
+        knob = box(around(0.12, middle), around(0.025, level), around(0.1, front))
+        parts += [face, knob]
     return parts
 
 
 def _hutch(rng: Generator, width: float, y: Span, back: float) -> list[Trimesh]:
     bottom, top = y
     z = (back, back + 0.25)
-    parts = [box(around(width), (top - 0.03, top), z)]
+    shelf = box(around(width), (top - 0.03, top), z)
+    parts = [shelf]
     end = width / 2 - 0.02
+    y_wall = (bottom, top - 0.03)
     for x in np.linspace(-end, end, rng.integers(2, 5)):
-        parts.append(box(around(0.03, x), (bottom, top - 0.03), z))
+        parts.append(box(around(0.03, x), y_wall, z))
     return parts

@@ -39,7 +39,8 @@ def table(rng: Generator) -> Trimesh:
         inset = rng.uniform(0.82, 0.98)
     kind = rng.random()
     if kind < 0.2:
-        legs = [_pillar(rng, min(width, depth), under)]
+        foot_width = min(width, depth)
+        legs = [_pillar(rng, foot_width, under)]
     elif kind < 0.35:
         legs = _trestles(width, depth, under)
     else:
@@ -66,7 +67,8 @@ def _trestles(width: float, depth: float, height: float) -> list[Trimesh]:
         post = box(around(0.07, x), (0.05, height), around(depth * 0.16))
         foot = box(around(0.09, x), (0, 0.06), around(depth * 0.75))
         parts += [post, foot]
-    bar = box(around(width * 0.68), around(0.1, height * 0.4), around(0.05))
+    level = around(0.1, height * 0.4)
+    bar = box(around(width * 0.68), level, around(0.05))
     return [*parts, bar]
 
 
@@ -77,10 +79,12 @@ def _table_legs(rng: Generator, width: float, depth: float, height: float) -> li
     parts, ends = four_legs(rng, width, depth, height, radius, splay)
     if rng.random() < 0.4:
         apron = (height - rng.uniform(0.07, 0.14), height)
+        along_x = around(width - 0.1)
+        along_z = around(depth - 0.1)
         for z in around(depth - 0.06):
-            parts.append(box(around(width - 0.1), apron, around(0.03, z)))
+            parts.append(box(along_x, apron, around(0.03, z)))
         for x in around(width - 0.06):
-            parts.append(box(around(0.03, x), apron, around(depth - 0.1)))
+            parts.append(box(around(0.03, x), apron, along_z))
     if rng.random() < 0.25:
         level = rng.uniform(0.12, 0.25)
         parts += rungs(ends, level, 0.03)
@@ -119,9 +123,10 @@ def _pole_lamp(
     rng: Generator, wide: float, narrow: float, deep: float, pole: float
 ) -> list[Trimesh]:
     y = rng.uniform(0.65, 1.25)
+    top = y + deep
     stem = rod((0, 0.03, 0), (0, y + deep * 0.8, 0), pole, 8)
-    shade = turned([(wide, y), (narrow, y + deep)])
-    level = y + deep - 0.01
+    shade = turned([(wide, y), (narrow, top)])
+    level = top - 0.01
     bar = rod((-narrow, level, 0), (narrow, level, 0), 0.01, 6)
     bulb = [
         (0, y + 0.04),
@@ -129,11 +134,17 @@ def _pole_lamp(
         (0.06, y + 0.1),
         (0, y + 0.16),
     ]
-    return named("pole", stem) + named("shade", shade, bar, turned(bulb, 10))
+    glass = turned(bulb, 10)
+    return named("pole", stem) + named("shade", shade, bar, glass)
 
 
 def _table_lamp(
-    rng: Generator, base: float, low: float, wide: float, narrow: float, deep: float
+    rng: Generator,
+    base: float,
+    low: float,
+    wide: float,
+    narrow: float,
+    deep: float,
 ) -> list[Trimesh]:
     """Return a turned foot, as of table lamps, and a shade from the height ``low``."""
     foot = rng.uniform(0.1, 0.22)
@@ -144,7 +155,8 @@ def _table_lamp(
         (0.025, low + deep),
     ]
     shade = turned([(wide, low), (narrow, low + deep)])
-    return named("base", turned(smooth(profile, 18))) + named("shade", shade)
+    body = turned(smooth(profile, 18))
+    return named("base", body) + named("shade", shade)
 
 
 def _bent_lamp(rng: Generator, wide: float, pole: float) -> list[Trimesh]:
@@ -157,21 +169,27 @@ def _bent_lamp(rng: Generator, wide: float, pole: float) -> list[Trimesh]:
         (reach, y * 0.85, 0),
     ]
     stem = tube(smooth(path, 20), pole, 8, across=(0, 0, 1))
-    shade = turned([(wide * 0.7, y * 0.85 - 0.2), (0.05, y * 0.85 + 0.02)])
+    level = y * 0.85
+    shade = turned([(wide * 0.7, level - 0.2), (0.05, level + 0.02)])
     shade.apply_translation((reach, 0, 0))
     return named("pole", stem) + named("shade", shade)
 
 
 def _jointed_lamp(rng: Generator, wide: float, pole: float) -> list[Trimesh]:
-    elbow = np.array((-rng.uniform(0.1, 0.35), rng.uniform(0.4, 0.6), 0))
-    head = elbow + np.array((rng.uniform(0.4, 0.65), rng.uniform(0.1, 0.4), 0))
+    elbow_x = -rng.uniform(0.1, 0.35)
+    elbow_y = rng.uniform(0.4, 0.6)
+    elbow = np.array((elbow_x, elbow_y, 0))
+    forearm_x = rng.uniform(0.4, 0.65)
+    forearm_y = rng.uniform(0.1, 0.4)
+    head = elbow + np.array((forearm_x, forearm_y, 0))
     hinge = np.array((0, 0, 0.04))
     lower_arm = rod((0, 0.05, 0), elbow, pole)
     upper_arm = rod(elbow, head, pole)
     joint = rod(elbow - hinge, elbow + hinge, 0.04)
     aim = np.array((rng.uniform(0.1, 0.5), -1.0, 0))
     tip = head + 0.22 * aim / np.linalg.norm(aim)
-    shade = rod(head - (tip - head) * 0.3, tip, (0.05, wide * 0.55), 24)
+    back = head - (tip - head) * 0.3
+    shade = rod(back, tip, (0.05, wide * 0.55), 24)
     return named("pole", lower_arm, upper_arm, joint) + named("shade", shade)
 
 
@@ -185,25 +203,41 @@ def shelf(rng: Generator) -> Trimesh:
     floors = np.linspace(foot, height - board, rng.integers(3, 7))
     inside = width / 2 - board
     z = around(depth)
-    parts = [box((-inside, inside), (y, y + board), z) for y in floors]
+    x_inside = (-inside, inside)
+    parts = [box(x_inside, (y, y + board), z) for y in floors]
     has_sides = rng.random() < 0.8
     if has_sides:
-        parts += [box(around(board, x), (0, height), z) for x in around(width - board)]
+        for x in around(width - board):
+            parts.append(box(around(board, x), (0, height), z))
     else:
-        for x in around(width - 0.06):
-            parts += [post(x, at, height, 0.03, 4) for at in around(depth - 0.06)]
+        parts += _shelf_posts(width, height, depth)
     has_back = rng.random() < 0.45
     if has_back:
-        parts.append(box(around(width - 2 * board), (foot, height), around(0.01, z[0])))
-    most_bays = 2 if width > 1 else 1
-    bays = np.linspace(-inside, inside, 1 + int(rng.integers(1, most_bays + 1)))
-    parts += [box(around(board * 0.8, x), (foot, height), z) for x in bays[1:-1]]
+        rear = around(0.01, z[0])
+        parts.append(box(around(width - 2 * board), (foot, height), rear))
+    most_bays = 1
+    if width > 1:
+        most_bays = 2
+    number_of_bays = int(rng.integers(1, most_bays + 1))
+    bays = np.linspace(-inside, inside, 1 + number_of_bays)
+    for x in bays[1:-1]:
+        parts.append(box(around(board * 0.8, x), (foot, height), z))
     for y, above in pairwise(floors):
         room = above - y - board
         for left, right in pairwise(bays):
             if rng.random() < 0.45:
-                parts += _books(rng, (left + 0.02, right - 0.02), y + board, room, z)
+                x_books = (left + 0.02, right - 0.02)
+                parts += _books(rng, x_books, y + board, room, z)
     return join(parts)
+
+
+def _shelf_posts(width: float, height: float, depth: float) -> list[Trimesh]:
+    """Return posts at the corners of a shelf."""
+    parts = []
+    for x in around(width - 0.06):
+        for z in around(depth - 0.06):
+            parts.append(post(x, z, height, 0.03, 4))
+    return parts
 
 
 def _books(rng: Generator, x: Span, y: float, room: float, z: Span) -> list[Trimesh]:
@@ -213,7 +247,8 @@ def _books(rng: Generator, x: Span, y: float, room: float, z: Span) -> list[Trim
     filled = (end - start) * rng.uniform(0.3, 0.9)
     number = max(2, int(filled / 0.09))
     thick = rng.uniform(0.04, 0.11, number)
-    edges = np.concatenate(([0], np.cumsum(thick))) * filled / thick.sum()
+    ends = np.concatenate(([0], np.cumsum(thick)))
+    edges = ends * filled / thick.sum()
     is_left = rng.random() < 0.5
     if is_left:
         edges = start + edges
@@ -223,5 +258,6 @@ def _books(rng: Generator, x: Span, y: float, room: float, z: Span) -> list[Trim
     for left, right in pairwise(edges):
         tall = room * rng.uniform(0.55, 0.9)
         deep = (front - back) * rng.uniform(0.6, 0.9)
-        parts.append(box((left, right), (y, y + tall), (back + 0.02, back + deep)))
+        z_book = (back + 0.02, back + deep)
+        parts.append(box((left, right), (y, y + tall), z_book))
     return parts

@@ -23,12 +23,14 @@ UPRIGHT = trimesh.transformations.rotation_matrix(-np.pi / 2, (1, 0, 0))
 
 def around(width: float, centre: float = 0.0) -> Span:
     """Return the span of a given width around a centre."""
-    return (centre - width / 2, centre + width / 2)
+    half = width / 2
+    return (centre - half, centre + half)
 
 
 def box(x: Span, y: Span, z: Span) -> Trimesh:
     """Return the axis-aligned box with three spans."""
-    return trimesh.creation.box(bounds=np.array((x, y, z)).T)
+    bounds = np.array((x, y, z)).T
+    return trimesh.creation.box(bounds=bounds)
 
 
 def cushion(x: Span, y: Span, z: Span, radius: float) -> Trimesh:
@@ -41,7 +43,8 @@ def cushion(x: Span, y: Span, z: Span, radius: float) -> Trimesh:
     centre = (low + high) / 2
     half = (high - low) / 2
     round_off = np.minimum(radius, half)
-    vertices = centre + np.sign(ball) * (half - round_off) + ball * round_off
+    corners = np.sign(ball) * (half - round_off)
+    vertices = centre + corners + ball * round_off
     return Trimesh(vertices, faces, process=False)
 
 
@@ -54,7 +57,8 @@ def _ball() -> tuple[Array, NDArray[np.int64]]:
     angles = np.linspace(-np.pi / 2, np.pi / 2, 9)
     profile = np.column_stack((np.cos(angles), np.sin(angles)))
     ball = trimesh.creation.revolve(profile, sections=16, process=False)
-    return np.asarray(ball.vertices).round(12), np.asarray(ball.faces)
+    vertices = np.asarray(ball.vertices).round(12)
+    return vertices, np.asarray(ball.faces)
 
 
 def loft(rings: ArrayLike) -> Trimesh:
@@ -64,16 +68,19 @@ def loft(rings: ArrayLike) -> Trimesh:
         rings: ``(R, K, 3)``, R cross-sections of K points each.
     """
     stack = np.asarray(rings, dtype=np.float64)
-    middles = stack[[0, -1]].mean(1, keepdims=True)
+    ends = stack[[0, -1]]
+    middles = ends.mean(1, keepdims=True)
     first, last = middles.repeat(stack.shape[1], axis=1)
     stack = np.concatenate((first[None], stack, last[None]))
     rows, sides = stack.shape[:2]
     here = np.arange((rows - 1) * sides)
-    after = here // sides * sides + (here + 1) % sides
+    ring_start = here // sides * sides
+    after = ring_start + (here + 1) % sides
     next_here = here + sides
     next_after = after + sides
-    faces = np.stack((here, after, next_here, after, next_after, next_here), axis=1)
-    return Trimesh(stack.reshape(-1, 3), faces.reshape(-1, 3), process=False)
+    corners = (here, after, next_here, after, next_after, next_here)
+    faces = np.stack(corners, axis=1).reshape(-1, 3)
+    return Trimesh(stack.reshape(-1, 3), faces, process=False)
 
 
 def tube(
@@ -97,9 +104,11 @@ def tube(
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     if across is None:
         start = along[0]
-        across = np.cross(start, np.eye(3)[np.abs(start).argmin()])
+        least = np.abs(start).argmin()
+        across = np.cross(start, np.eye(3)[least])
     normal = np.asarray(across, dtype=np.float64)
-    normal = np.broadcast_to(normal / np.linalg.norm(normal), centres.shape)
+    normal = normal / np.linalg.norm(normal)
+    normal = np.broadcast_to(normal, centres.shape)
     first = normal[:, None] * flatten
     second = np.cross(along, normal)[:, None]
 
@@ -108,18 +117,23 @@ def tube(
     sines = np.sin(turn)[None, :, None]
     ring = cosines * first + sines * second
     # Radius of the inscribed circle, so that bars with few corners are not thinner.
-    reach = np.broadcast_to(radii, len(centres)) / np.cos(np.pi / sections)
-    return loft(centres[:, None] + reach[:, None, None] * ring)
+    widths = np.broadcast_to(radii, len(centres))
+    reach = widths / np.cos(np.pi / sections)
+    rings = centres[:, None] + reach[:, None, None] * ring
+    return loft(rings)
 
 
 def rod(start: ArrayLike, end: ArrayLike, radius: ArrayLike, sections: int = 12) -> Trimesh:
     """Return a straight bar; ``radius`` is one number, or one per end."""
-    return tube(np.stack((np.asarray(start), np.asarray(end))), radius, sections)
+    path = np.stack((np.asarray(start), np.asarray(end)))
+    return tube(path, radius, sections)
 
 
 def post(x: float, z: float, height: float, radius: float, sections: int) -> Trimesh:
     """Return an upright bar that stands on the ground."""
-    return rod((x, 0, z), (x, height, z), radius, sections)
+    foot = (x, 0, z)
+    top = (x, height, z)
+    return rod(foot, top, radius, sections)
 
 
 def turned(profile: ArrayLike, sections: int = 32) -> Trimesh:
@@ -137,7 +151,13 @@ def turned(profile: ArrayLike, sections: int = 32) -> Trimesh:
 def disc(radius: float, y: Span) -> Trimesh:
     """Return a closed upright cylinder about the y axis."""
     low, high = y
-    return turned(((0, low), (radius, low), (radius, high), (0, high)))
+    profile = [
+        (0, low),
+        (radius, low),
+        (radius, high),
+        (0, high),
+    ]
+    return turned(profile)
 
 
 def smooth(points: ArrayLike, steps: int = 24) -> Array:
@@ -150,7 +170,8 @@ def smooth(points: ArrayLike, steps: int = 24) -> Array:
     knots = np.asarray(points, dtype=np.float64)
     places = np.arange(len(knots))
     curve = PchipInterpolator(places, knots)
-    return curve(np.linspace(0, len(knots) - 1, steps))
+    samples = np.linspace(0, len(knots) - 1, steps)
+    return curve(samples)
 
 
 def named(part: str, *meshes: Trimesh) -> list[Trimesh]:
@@ -168,10 +189,12 @@ def join(parts: Sequence[Trimesh]) -> Trimesh:
     start = 0
     for part in parts:
         faces.append(part.faces + start)
-        names += [part.metadata.get("part", "")] * len(part.faces)
+        name = part.metadata.get("part", "")
+        names += [name] * len(part.faces)
         start += len(part.vertices)
+    vertices = [part.vertices for part in parts]
     return Trimesh(
-        np.concatenate([part.vertices for part in parts]),
+        np.concatenate(vertices),
         np.concatenate(faces),
         process=False,
         metadata={"parts": np.array(names)},
@@ -179,7 +202,12 @@ def join(parts: Sequence[Trimesh]) -> Trimesh:
 
 
 def four_legs(
-    rng: Generator, width: float, depth: float, height: float, radius: float, splay: float = 0.0
+    rng: Generator,
+    width: float,
+    depth: float,
+    height: float,
+    radius: float,
+    splay: float = 0.0,
 ) -> tuple[list[Trimesh], Array]:
     """Return four legs, round or square, straight or tapered, and their ends.
 
@@ -197,13 +225,21 @@ def four_legs(
     """
     sections = int(rng.choice((4, 12)))
     taper = rng.uniform(0.5, 1.0)
-    corners = np.array([(-1, 1), (1, 1), (1, -1), (-1, -1)])
+    corners = np.array(
+        [
+            (-1, 1),
+            (1, 1),
+            (1, -1),
+            (-1, -1),
+        ]
+    )
     tops = corners * (width / 2 - radius, depth / 2 - radius)
     feet = tops + corners * splay * height
     tops = np.insert(tops, 1, height, axis=1)
     feet = np.insert(feet, 1, 0.0, axis=1)
     ends = np.stack((tops, feet), axis=1)
-    legs = [rod(top, foot, (radius, radius * taper), sections) for top, foot in ends]
+    radii = (radius, radius * taper)
+    legs = [rod(top, foot, radii, sections) for top, foot in ends]
     return legs, ends
 
 
@@ -216,4 +252,5 @@ def rungs(ends: Array, level: float, radius: float) -> list[Trimesh]:
     feet = ends[:, 1]
     places = feet + level * (tops - feet)
     next_places = np.roll(places, -1, axis=0)
-    return [rod(here, there, radius, 8) for here, there in zip(places, next_places, strict=True)]
+    pairs = zip(places, next_places, strict=True)
+    return [rod(here, there, radius, 8) for here, there in pairs]

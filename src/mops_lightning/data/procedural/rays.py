@@ -33,7 +33,8 @@ class Camera(NamedTuple):
         forward = forward / np.linalg.norm(forward)
         right = np.cross(forward, (0.0, 1.0, 0.0))
         right /= np.linalg.norm(right)
-        return cls(place, np.stack((right, np.cross(right, forward), forward)))
+        up = np.cross(right, forward)
+        return cls(place, np.stack((right, up, forward)))
 
     def seen(self, points: Array) -> Array:
         """Return points ``(..., 3)`` in the axes of the camera; the third is the depth."""
@@ -64,10 +65,12 @@ class RayGrid(NamedTuple):
             side: number of rays along each axis.
             shift: ``(2,)`` of the grid, in spacings between 0 and 1.
         """
-        image = seen[:, :2] / seen[:, 2:]
+        depths = seen[:, 2:]
+        image = seen[:, :2] / depths
         low = image.min(0)
         spacing = (image.max(0) - low) / side
-        steps = low + (np.arange(side)[:, None] + shift) * spacing
+        positions = np.arange(side)[:, None] + shift
+        steps = low + positions * spacing
         return cls(steps[:, 0], steps[:, 1])
 
     @property
@@ -77,7 +80,9 @@ class RayGrid(NamedTuple):
         Their depth is 1.
         """
         across, up = np.meshgrid(self.across, self.up)
-        return np.stack((across, up, np.ones_like(across)), axis=-1).reshape(-1, 3)
+        ones = np.ones_like(across)
+        directions = np.stack((across, up, ones), axis=-1)
+        return directions.reshape(-1, 3)
 
 
 def nearest_faces(triangles: Array, grid: RayGrid) -> tuple[Array, Rows]:
@@ -97,20 +102,26 @@ def nearest_faces(triangles: Array, grid: RayGrid) -> tuple[Array, Rows]:
     low = image.min(1)
     high = image.max(1)
     first_column = np.searchsorted(grid.across, low[:, 0])
-    columns = np.searchsorted(grid.across, high[:, 0], side="right") - first_column
+    last_column = np.searchsorted(grid.across, high[:, 0], side="right")
+    columns = last_column - first_column
     first_row = np.searchsorted(grid.up, low[:, 1])
-    rows = np.searchsorted(grid.up, high[:, 1], side="right") - first_row
+    last_row = np.searchsorted(grid.up, high[:, 1], side="right")
+    rows = last_row - first_row
     pairs = columns * rows
 
-    depths = np.full(len(grid.across) * len(grid.up), np.inf)
+    width = len(grid.across)
+    depths = np.full(width * len(grid.up), np.inf)
     faces = np.full(len(depths), NOTHING)
     directions = grid.directions
     for group in _groups(pairs):
-        face = np.repeat(group, pairs[group])
-        ends = np.cumsum(pairs[group])
-        place = np.arange(len(face)) - np.repeat(ends - pairs[group], pairs[group])
+        pairs_of_group = pairs[group]
+        face = np.repeat(group, pairs_of_group)
+        ends = np.cumsum(pairs_of_group)
+        starts = np.repeat(ends - pairs_of_group, pairs_of_group)
+        place = np.arange(len(face)) - starts
         row = first_row[face] + place // columns[face]
-        ray = row * len(grid.across) + first_column[face] + place % columns[face]
+        column = first_column[face] + place % columns[face]
+        ray = row * width + column
         depth = _depths(triangles[face], directions[ray])
         _keep_nearest(depths, faces, ray, depth, face)
     return depths, faces
@@ -120,7 +131,8 @@ def _groups(pairs: Rows) -> list[Rows]:
     """Split the triangles that have rays into groups of about ``MOST_PAIRS`` comparisons."""
     compared = np.flatnonzero(pairs)
     number = np.cumsum(pairs[compared]) // MOST_PAIRS
-    return np.split(compared, np.flatnonzero(np.diff(number)) + 1)
+    is_new = np.diff(number)
+    return np.split(compared, np.flatnonzero(is_new) + 1)
 
 
 def _depths(triangles: Array, directions: Array) -> Array:
@@ -132,13 +144,19 @@ def _depths(triangles: Array, directions: Array) -> Array:
         triangles: ``(P, 3, 3)`` corners.
         directions: ``(P, 3)`` of the rays from the origin, with depth 1.
     """
-    first, second, third = triangles[:, 0], triangles[:, 1], triangles[:, 2]
-    sides = np.stack(
-        [
-            np.einsum("pc,pc->p", np.cross(start, end), directions)
-            for start, end in ((first, second), (second, third), (third, first))
-        ]
+    first = triangles[:, 0]
+    second = triangles[:, 1]
+    third = triangles[:, 2]
+    edges = (
+        (first, second),
+        (second, third),
+        (third, first),
     )
+    sides_of_edges = []
+    for start, end in edges:
+        normal = np.cross(start, end)
+        sides_of_edges.append(np.einsum("pc,pc->p", normal, directions))
+    sides = np.stack(sides_of_edges)
     inside = (sides >= 0).all(0) | (sides <= 0).all(0)
     normals = np.cross(second - first, third - first)
     towards = np.einsum("pc,pc->p", normals, directions)
@@ -152,9 +170,12 @@ def _depths(triangles: Array, directions: Array) -> Array:
 def _keep_nearest(depths: Array, faces: Rows, ray: Rows, depth: Array, face: Rows) -> None:
     """Write the nearest new depth of every ray, and its face, where it is nearer than the old."""
     hit = np.flatnonzero(np.isfinite(depth))
-    order = hit[np.lexsort((depth[hit], ray[hit]))]
+    by_ray_and_depth = np.lexsort((depth[hit], ray[hit]))
+    order = hit[by_ray_and_depth]
     rays, places = np.unique(ray[order], return_index=True)
     nearest = order[places]
-    nearer = depth[nearest] < depths[rays]
-    depths[rays[nearer]] = depth[nearest[nearer]]
-    faces[rays[nearer]] = face[nearest[nearer]]
+    is_nearer = depth[nearest] < depths[rays]
+    nearer_rays = rays[is_nearer]
+    nearer = nearest[is_nearer]
+    depths[nearer_rays] = depth[nearer]
+    faces[nearer_rays] = face[nearer]

@@ -82,7 +82,9 @@ class Scan(NamedTuple):
 
     def take(self, rows: Rows) -> "Scan":
         """Return some of the points."""
-        return Scan(self.points[rows], self.parts[rows], self.intensities[rows])
+        points = self.points[rows]
+        parts = self.parts[rows]
+        return Scan(points, parts, self.intensities[rows])
 
 
 def scan_of_shape(
@@ -116,7 +118,8 @@ def scan_of_shape(
     mesh, angle = built(class_name, form)
     mesh.vertices = mesh.vertices @ rotation_about_y(angle)
     scene = _scene(mesh, rng)
-    cameras = [_camera(rng) for _ in range(rng.integers(1, MOST_VIEWS + 1))]
+    number_of_views = rng.integers(1, MOST_VIEWS + 1)
+    cameras = [_camera(rng) for _ in range(number_of_views)]
     flying = round(n_points * rng.uniform(0, outliers))
     side = 8 + int(2 * np.sqrt(n_points))
     while True:
@@ -125,12 +128,14 @@ def scan_of_shape(
         if len(surfaces.points) >= n_points:
             break
         side *= 2
-    kept = rng.choice(len(surfaces.points), n_points - flying, replace=False)
+    on_surfaces = n_points - flying
+    kept = rng.choice(len(surfaces.points), on_surfaces, replace=False)
     edges = _joined([view.edges for view in views])
     at_edges = min(flying // 2, len(edges.points))
     drawn = rng.choice(len(edges.points), at_edges, replace=False)
     stray = _stray(flying - at_edges, rng)
-    scan = _joined([surfaces.take(kept), edges.take(drawn), stray])
+    parts = [surfaces.take(kept), edges.take(drawn), stray]
+    scan = _joined(parts)
     return scan.take(rng.permutation(n_points))
 
 
@@ -142,23 +147,33 @@ def _scene(mesh: Trimesh, rng: Generator) -> Scene:
     middle[1] = low[1]
     offset = rng.uniform(-MOST_OFFSET, MOST_OFFSET, 3) * (1, 0, 1)
     mesh.vertices = (mesh.vertices - middle) / size + offset
-    reach = np.linalg.norm((mesh.vertices - offset)[:, [0, 2]], axis=1).max()
+    from_offset = mesh.vertices - offset
+    reach = np.linalg.norm(from_offset[:, [0, 2]], axis=1).max()
     names = parts_of_faces(mesh)
     parts = [np.where(names == "", OBJECT, names)]
     corners = [mesh.triangles]
-    albedos = [np.full(len(mesh.faces), rng.uniform(0.3, 1.0))]
+    albedos = [_one_albedo(mesh, rng)]
     for _ in range(rng.integers(1, MOST_CLUTTER + 1)):
         thing = _thing(rng, offset, reach)
         if thing is None:
             continue
         corners.append(thing.triangles)
         parts.append(np.full(len(thing.faces), CLUTTER))
-        albedos.append(np.full(len(thing.faces), rng.uniform(0.3, 1.0)))
+        albedos.append(_one_albedo(thing, rng))
     floor = turned(((0, 0), (FLOOR_RADIUS, 0)))
     corners.append(floor.triangles)
     parts.append(np.full(len(floor.faces), FLOOR))
-    albedos.append(np.full(len(floor.faces), rng.uniform(0.3, 1.0)))
-    return Scene(np.concatenate(corners), np.concatenate(parts), np.concatenate(albedos))
+    albedos.append(_one_albedo(floor, rng))
+    return Scene(
+        corners=np.concatenate(corners),
+        parts=np.concatenate(parts),
+        albedos=np.concatenate(albedos),
+    )
+
+
+def _one_albedo(mesh: Trimesh, rng: Generator) -> Array:
+    """Return an albedo that all faces of a mesh share."""
+    return np.full(len(mesh.faces), rng.uniform(0.3, 1.0))
 
 
 def _thing(rng: Generator, offset: Array, reach: float) -> Trimesh | None:
@@ -176,13 +191,15 @@ def _thing(rng: Generator, offset: Array, reach: float) -> Trimesh | None:
     for _ in range(TRIES):
         angle = rng.uniform(0, 2 * np.pi)
         distance = (FLOOR_RADIUS - width) * np.sqrt(rng.random())
-        place = distance * np.array((np.cos(angle), 0, np.sin(angle)))
+        direction = np.array((np.cos(angle), 0, np.sin(angle)))
+        place = distance * direction
         if np.linalg.norm(place - offset) > reach + width:
             break
     else:
         return None
     if kind == 0:
-        thing = box(around(2 * half), (0.0, height), around(half * rng.uniform(0.5, 2.0)))
+        depth = half * rng.uniform(0.5, 2.0)
+        thing = box(around(2 * half), (0.0, height), around(depth))
     elif kind == 1:
         thing = disc(half, (0.0, height))
     else:
@@ -196,8 +213,11 @@ def _camera(rng: Generator) -> Camera:
     angle = rng.uniform(0, 2 * np.pi)
     distance = rng.uniform(2.0, 3.0)
     height = rng.uniform(0.5, 1.5)
-    place = np.array((distance * np.cos(angle), height, distance * np.sin(angle)))
-    return Camera.looking_at(np.array((0.0, 0.2, 0.0)), place)
+    x = distance * np.cos(angle)
+    z = distance * np.sin(angle)
+    place = np.array((x, height, z))
+    target = np.array((0.0, 0.2, 0.0))
+    return Camera.looking_at(target, place)
 
 
 class View(NamedTuple):
@@ -210,20 +230,26 @@ class View(NamedTuple):
 def _view(scene: Scene, camera: Camera, side: int, noise: float, rng: Generator) -> View:
     """Scan a scene from one place with ``side`` times ``side`` rays."""
     triangles = camera.seen(scene.corners)
-    grid = RayGrid.around(triangles.reshape(-1, 3), side, rng.random(2))
+    shift = rng.random(2)
+    grid = RayGrid.around(triangles.reshape(-1, 3), side, shift)
     depths, faces = nearest_faces(triangles, grid)
     lengths = np.linalg.norm(grid.directions, axis=1)
     units = grid.directions / lengths[:, None]
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    first_sides = triangles[:, 1] - triangles[:, 0]
+    second_sides = triangles[:, 2] - triangles[:, 0]
+    normals = np.cross(first_sides, second_sides)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-12)
 
     rays = np.flatnonzero(faces != NOTHING)
     face = faces[rays]
-    ranges = depths[rays] * lengths[rays] + noise * rng.standard_normal(len(rays))
-    facing = np.abs(np.einsum("rc,rc->r", normals[face], units[rays]))
-    shades = scene.albedos[face] * facing
-    shades = (shades + INTENSITY_NOISE * rng.standard_normal(len(rays))).clip(0, 1)
-    surfaces = Scan(camera.world(units[rays] * ranges[:, None]), scene.parts[face], shades)
+    unit = units[rays]
+    range_noise = noise * rng.standard_normal(len(rays))
+    ranges = depths[rays] * lengths[rays] + range_noise
+    facing = np.abs(np.einsum("rc,rc->r", normals[face], unit))
+    intensity_noise = INTENSITY_NOISE * rng.standard_normal(len(rays))
+    shades = scene.albedos[face] * facing + intensity_noise
+    points = camera.world(unit * ranges[:, None])
+    surfaces = Scan(points, scene.parts[face], shades.clip(0, 1))
 
     across = depths.reshape(side, side)
     next_to = np.roll(across, -1, axis=1)
@@ -231,13 +257,16 @@ def _view(scene: Scene, camera: Camera, side: int, noise: float, rng: Generator)
     step = np.full_like(across, np.inf)
     both = np.isfinite(across) & np.isfinite(next_to)
     np.subtract(next_to, across, out=step, where=both)
-    at_edge = np.flatnonzero(both & (np.abs(step) > STEP))
+    is_edge = both & (np.abs(step) > STEP)
+    at_edge = np.flatnonzero(is_edge)
     share = rng.uniform(0.1, 0.9, len(at_edge))
     between = depths[at_edge] + share * step.ravel()[at_edge]
+    edge_points = camera.world(grid.directions[at_edge] * between[:, None])
+    edge_albedos = scene.albedos[faces[at_edge]]
     edges = Scan(
-        camera.world(grid.directions[at_edge] * between[:, None]),
+        edge_points,
         np.full(len(at_edge), OUTLIER),
-        scene.albedos[faces[at_edge]] * rng.uniform(0, 1, len(at_edge)),
+        edge_albedos * rng.uniform(0, 1, len(at_edge)),
     )
     return View(surfaces, edges)
 
@@ -247,14 +276,16 @@ def _stray(number: int, rng: Generator) -> Scan:
     angle = rng.uniform(0, 2 * np.pi, number)
     radius = FLOOR_RADIUS * np.sqrt(rng.random(number))
     height = rng.uniform(0, STRAY_HEIGHT, number)
-    points = np.column_stack((radius * np.cos(angle), height, radius * np.sin(angle)))
-    return Scan(points, np.full(number, OUTLIER), rng.uniform(0, 0.5, number))
+    x = radius * np.cos(angle)
+    z = radius * np.sin(angle)
+    points = np.column_stack((x, height, z))
+    intensities = rng.uniform(0, 0.5, number)
+    return Scan(points, np.full(number, OUTLIER), intensities)
 
 
 def _joined(scans: Sequence[Scan]) -> Scan:
     """Return all points of several scans."""
-    return Scan(
-        np.concatenate([scan.points for scan in scans]),
-        np.concatenate([scan.parts for scan in scans]),
-        np.concatenate([scan.intensities for scan in scans]),
-    )
+    points = [scan.points for scan in scans]
+    parts = [scan.parts for scan in scans]
+    intensities = [scan.intensities for scan in scans]
+    return Scan(np.concatenate(points), np.concatenate(parts), np.concatenate(intensities))

@@ -31,20 +31,24 @@ def chair(rng: Generator) -> Trimesh:
     rise = rng.uniform(0.3, 1.25)
     thick = rng.uniform(0.06, 0.16)
     under = seat - thick
+    rear = -depth / 2
     parts = named("seat", _pad(rng, width, depth, (under, seat)))
     if rng.random() < 0.25:
-        legs = _swivel(rng, under, min(width, depth) * 0.5)
+        reach = min(width, depth) * 0.5
+        legs = _swivel(rng, under, reach)
     else:
         legs = _chair_legs(rng, width, depth, under)
     parts += named("leg", *legs)
-    parts += named("back", _chair_back(rng, width, -depth / 2, (seat, seat + rise)))
+    back = _chair_back(rng, width, rear, (seat, seat + rise))
+    parts += named("back", back)
     if rng.random() < 0.3:
         y = seat + rise * rng.uniform(0.3, 0.6)
         reach = depth * rng.uniform(0.25, 0.45)
-        z = (-depth / 2, reach)
+        y_span = (seat - thick / 2, y)
+        z_span = (rear, reach)
         for side in (-1, 1):
             x = side * (width / 2 - 0.03)
-            parts += named("arm", *_chair_arm(x, (seat - thick / 2, y), z))
+            parts += named("arm", *_chair_arm(x, y_span, z_span))
     return join(parts)
 
 
@@ -62,7 +66,9 @@ def _chair_arm(x: float, y: Span, z: Span) -> list[Trimesh]:
     low, high = y
     front = z[1] - 0.06
     rest = box(around(0.09, x), around(0.05, high), z)
-    support = rod((x, low, front), (x, high, front), 0.03, 8)
+    foot = (x, low, front)
+    top = (x, high, front)
+    support = rod(foot, top, 0.03, 8)
     return [rest, support]
 
 
@@ -74,11 +80,14 @@ def _pad(rng: Generator, width: float, depth: float, y: Span) -> Trimesh:
 
 def _swivel(rng: Generator, height: float, reach: float) -> list[Trimesh]:
     star = rng.integers(4, 6)
-    parts = [rod((0, 0.12, 0), (0, height, 0), 0.05)]
+    pillar = rod((0, 0.12, 0), (0, height, 0), 0.05)
+    hub = (0, 0.15, 0)
+    parts = [pillar]
     turns = 2 * np.pi * np.arange(star) / star + np.pi / 2
     for turn in turns:
-        foot = (reach * np.cos(turn), 0.04, reach * np.sin(turn))
-        parts.append(rod((0, 0.15, 0), foot, (0.05, 0.03), 6))
+        x = reach * np.cos(turn)
+        z = reach * np.sin(turn)
+        parts.append(rod(hub, (x, 0.04, z), (0.05, 0.03), 6))
     return parts
 
 
@@ -97,11 +106,12 @@ def _chair_back(rng: Generator, width: float, z: float, y: Span) -> Trimesh:
     elif kind == 2:
         parts += _rails(rng, x, y)
     elif kind == 3:
-        panel = (low + (high - low) * 0.2, high - 0.1)
-        parts.append(box(x, panel, around(0.04)))
+        bottom = low + (high - low) * 0.2
+        parts.append(box(x, (bottom, high - 0.1), around(0.04)))
     back = join(parts)
     lean = rng.uniform(0.0, 0.28)
-    above_seat = np.clip(back.vertices[:, 1] - low, 0, None)
+    heights = back.vertices[:, 1] - low
+    above_seat = np.clip(heights, 0, None)
     back.vertices[:, 2] += z + 0.05 - lean * above_seat
     return back
 
@@ -109,31 +119,40 @@ def _chair_back(rng: Generator, width: float, z: float, y: Span) -> Trimesh:
 def _cushioned_back(rng: Generator, width: float, x: Span, y: Span) -> list[Trimesh]:
     low, high = y
     gap = rng.uniform(0.0, 0.25)
-    parts = [cushion(around(width * 0.95), (low + gap, high), around(0.11), 0.05)]
+    bottom = low + gap
+    pad = cushion(around(width * 0.95), (bottom, high), around(0.11), 0.05)
+    parts = [pad]
     for side in x:
-        parts.append(rod((side, low - 0.05, 0), (side, low + gap + 0.1, 0), POST))
+        foot = (side, low - 0.05, 0)
+        top = (side, bottom + 0.1, 0)
+        parts.append(rod(foot, top, POST))
     return parts
 
 
 def _back_frame(x: Span, y: Span) -> list[Trimesh]:
     """Return two posts and the rail between their upper ends."""
     low, high = y
-    posts = [rod((side, low - 0.05, 0), (side, high, 0), POST, 8) for side in x]
+    parts = []
+    for side in x:
+        foot = (side, low - 0.05, 0)
+        top = (side, high, 0)
+        parts.append(rod(foot, top, POST, 8))
     rail = box(x, (high - 0.16, high), around(0.06))
-    return [*posts, rail]
+    return [*parts, rail]
 
 
 def _slats(rng: Generator, x: Span, y: Span) -> list[Trimesh]:
     low, high = y
     left, right = x
-    places = np.linspace(left, right, rng.integers(5, 8))[1:-1]
-    return [box(around(0.06, place), (low, high - 0.16), around(0.04)) for place in places]
+    places = np.linspace(left, right, rng.integers(5, 8))
+    y_slat = (low, high - 0.16)
+    return [box(around(0.06, place), y_slat, around(0.04)) for place in places[1:-1]]
 
 
 def _rails(rng: Generator, x: Span, y: Span) -> list[Trimesh]:
     low, high = y
-    levels = np.linspace(low, high - 0.08, rng.integers(4, 6))[1:-1]
-    return [box(x, around(0.1, level), around(0.04)) for level in levels]
+    levels = np.linspace(low, high - 0.08, rng.integers(4, 6))
+    return [box(x, around(0.1, level), around(0.04)) for level in levels[1:-1]]
 
 
 def stool(rng: Generator) -> Trimesh:
@@ -157,8 +176,12 @@ def stool(rng: Generator) -> Trimesh:
         if is_round and kind < 0.6:
             legs, ends = _three_legs(width, under, radius, splay)
         else:
-            inset = 0.75 if is_round else 1.0
-            legs, ends = four_legs(rng, width * inset, depth * inset, under, radius, splay)
+            top_width = width
+            top_depth = depth
+            if is_round:  # legs under the corners of an inscribed square
+                top_width *= 0.75
+                top_depth *= 0.75
+            legs, ends = four_legs(rng, top_width, top_depth, under, radius, splay)
         if rng.random() < 0.7:
             level = rng.uniform(0.2, 0.45)
             legs += rungs(ends, level, 0.025)
@@ -175,9 +198,12 @@ def _stool_foot(rng: Generator, width: float, height: float, under: float) -> li
         ring = width * 0.33
         y = height * rng.uniform(0.3, 0.45)
         turn = np.linspace(0, 2 * np.pi, 25)
-        path = np.column_stack((np.cos(turn) * ring, np.full(25, y), np.sin(turn) * ring))
+        x = np.cos(turn) * ring
+        z = np.sin(turn) * ring
+        path = np.column_stack((x, np.full(25, y), z))
+        circle = tube(path, 0.025, 8, across=(0, 1, 0))
         bar = rod((-ring, y, 0), (ring, y, 0), 0.02, 8)
-        parts += [tube(path, 0.025, 8, across=(0, 1, 0)), bar]
+        parts += [circle, bar]
     return parts
 
 
@@ -190,7 +216,8 @@ def _three_legs(
     tops = out * width * 0.36 + (0, height, 0)
     feet = out * (width * 0.36 + splay * height)
     ends = np.stack((tops, feet), axis=1)
-    legs = [rod(top, foot, (radius, radius * 0.8)) for top, foot in ends]
+    radii = (radius, radius * 0.8)
+    legs = [rod(top, foot, radii) for top, foot in ends]
     return legs, ends
 
 
@@ -210,16 +237,21 @@ def sofa(rng: Generator) -> Trimesh:
     edge = rng.uniform(0.03, 0.09)
     rear = -depth / 2
     front = depth / 2
+    depth_of_back = (rear, rear + thick * 0.5)
+    depth_of_arm = (rear + thick * 0.3, front)
+    depth_of_pad = (rear + thick * 0.45, rear + thick)
     parts = [
         box(around(width), (foot, base), (front - 0.1, front - 0.03)),
-        cushion(around(whole), (foot, back), (rear, rear + thick * 0.5), edge),
+        cushion(around(whole), (foot, back), depth_of_back, edge),
     ]
     for side in (-1, 1):
         x = around(arm, side * (width + arm) / 2)
-        parts.append(cushion(x, (foot, rest), (rear + thick * 0.3, front), edge))
+        parts.append(cushion(x, (foot, rest), depth_of_arm, edge))
         x_foot = side * (whole / 2 - 0.08)
         for z in (rear + 0.1, front - 0.1):
-            parts.append(rod((x_foot, 0, z), (x_foot, foot + 0.01, z), 0.035, 8))
+            ground = (x_foot, 0, z)
+            top = (x_foot, foot + 0.01, z)
+            parts.append(rod(ground, top, 0.035, 8))
     long_seat = _long_seat(rng, seats)
     each = width / seats
     for number in range(seats):
@@ -228,9 +260,9 @@ def sofa(rng: Generator) -> Trimesh:
         end = front
         if number == long_seat:
             end = front + 0.6
-        parts.append(cushion(x, (base, seat), (rear + thick * 0.5, end), 0.06))
-        behind = (rear + thick * 0.45, rear + thick)
-        parts.append(cushion(x, (seat, back + 0.03), behind, 0.06))
+        depth_of_seat = (rear + thick * 0.5, end)
+        parts.append(cushion(x, (base, seat), depth_of_seat, 0.06))
+        parts.append(cushion(x, (seat, back + 0.03), depth_of_pad, 0.06))
         if number == long_seat:
             parts.append(box(x, (foot, base), (front, end)))
     return join(parts)
@@ -241,4 +273,6 @@ def _long_seat(rng: Generator, seats: int) -> int | None:
     if seats == 1 or rng.random() >= 0.3:
         return None
     side = rng.choice((-1, 1))
-    return 0 if side == -1 else seats - 1
+    if side == -1:
+        return 0
+    return seats - 1

@@ -28,10 +28,12 @@ def bottle(rng: Generator) -> Trimesh:
     start = shoulder + rng.uniform(0.1, 0.2)
     kind = rng.choice(3, p=(0.5, 0.25, 0.25))
     waists = (1.0, rng.uniform(0.72, 0.88), rng.uniform(1.1, 1.25))
+    waist = radius * waists[kind]
+    waist_height = shoulder * rng.uniform(0.4, 0.6)
     body = [
         (radius * 0.9, 0.0),
         (radius, 0.04),
-        (radius * waists[kind], shoulder * rng.uniform(0.4, 0.6)),
+        (waist, waist_height),
         (radius, shoulder),
         (neck, start),
         (neck, height),
@@ -39,12 +41,15 @@ def bottle(rng: Generator) -> Trimesh:
     is_straight = kind == 0
     if is_straight:  # a smooth curve would round off the wall
         del body[2]
-    parts = [turned([(0.0, 0.0), *smooth(body, 28)])]
+    wall = smooth(body, 28)
+    parts = [turned([(0.0, 0.0), *wall])]
     has_cap = rng.random() < 0.7
     if has_cap:
-        parts.append(disc(neck * rng.uniform(1.15, 1.5), (height - 0.09, height + 0.03)))
+        cap_radius = neck * rng.uniform(1.15, 1.5)
+        parts.append(disc(cap_radius, (height - 0.09, height + 0.03)))
     else:
-        parts.append(turned([(neck * 1.25, height - 0.05), (neck * 1.25, height)]))
+        lip = neck * 1.25
+        parts.append(turned([(lip, height - 0.05), (lip, height)]))
     return join(parts)
 
 
@@ -54,13 +59,15 @@ def vase(rng: Generator) -> Trimesh:
     height = 1.0
     foot = belly * rng.uniform(0.4, 0.7)
     neck = belly * rng.uniform(0.28, 0.85)
-    lip = min(neck * rng.uniform(1.05, 1.9), belly * 1.15)
+    widest_lip = belly * 1.15
+    lip = min(neck * rng.uniform(1.05, 1.9), widest_lip)
     low = rng.uniform(0.3, 0.55)
     high = rng.uniform(0.72, 0.85)
     is_beaker = rng.random() < 0.25
     if is_beaker:  # no belly, wider at the top
         middle = foot * rng.uniform(0.9, 1.3)
-        wall = smooth([(foot, 0), (middle, low), (belly, height)], 24)
+        profile = [(foot, 0), (middle, low), (belly, height)]
+        wall = smooth(profile, 24)
         return turned([(0.0, 0.0), *wall])
     profile = [
         (foot, 0),
@@ -89,15 +96,18 @@ def bowl(rng: Generator) -> Trimesh:
     ring = rng.uniform(0.02, 0.14)
     bulge = rng.uniform(1.5, 3.2)
     up = np.linspace(0, 1, 16)
-    wall = foot + (radius - foot) * (1 - (1 - up) ** bulge) ** (1 / 1.3)
+    share_out = (1 - (1 - up) ** bulge) ** (1 / 1.3)
+    wall = foot + (radius - foot) * share_out
     profile = np.column_stack((wall, ring + depth * up))
     body = turned([(0.0, ring), *profile])
-    stand = turned([(foot * 0.95, 0), (foot * 0.95, ring)])
+    stand_radius = foot * 0.95
+    stand = turned([(stand_radius, 0), (stand_radius, ring)])
     parts = [body, stand]
     if rng.random() < 0.4:
         lip = rng.uniform(0.03, 0.1)
         edge = ring + depth
-        parts.append(turned([(radius, edge), (radius + lip, edge + lip * 0.3)]))
+        lip_end = (radius + lip, edge + lip * 0.3)
+        parts.append(turned([(radius, edge), lip_end]))
     return join(parts)
 
 
@@ -108,7 +118,8 @@ def cup(rng: Generator) -> Trimesh:
     foot = radius * rng.uniform(0.55, 1.0)
     waist = rng.uniform(0.85, 1.12)
     middle = (radius + foot) / 2 * waist
-    wall = smooth([(foot, 0), (middle, height * 0.45), (radius, height)], 14)
+    wall_profile = [(foot, 0), (middle, height * 0.45), (radius, height)]
+    wall = smooth(wall_profile, 14)
     parts = named("vessel", turned([(0.0, 0.0), *wall]))
     top = height * rng.uniform(0.78, 0.92)
     low = height * rng.uniform(0.15, 0.4)
@@ -117,8 +128,8 @@ def cup(rng: Generator) -> Trimesh:
     parts += named("handle", _handle(wall, top, low, reach, thick))
     if rng.random() < 0.25:
         plate = radius * rng.uniform(1.5, 1.9)
-        profile = [(0, -0.03), (plate * 0.6, -0.03), (plate, 0.05)]
-        parts += named("saucer", turned(profile))
+        saucer = [(0, -0.03), (plate * 0.6, -0.03), (plate, 0.05)]
+        parts += named("saucer", turned(saucer))
     return join(parts)
 
 
@@ -127,7 +138,8 @@ def bucket(rng: Generator) -> Trimesh:
     radius = 0.5
     height = rng.uniform(0.75, 1.1)
     foot = radius * rng.uniform(0.6, 0.85)
-    parts = [turned([(0, 0), (foot, 0), (radius, height)])]
+    body = turned([(0, 0), (foot, 0), (radius, height)])
+    parts = [body]
     rim = rng.uniform(0.025, 0.06)
     edge = [
         (radius, height - rim),
@@ -138,9 +150,14 @@ def bucket(rng: Generator) -> Trimesh:
     for level in rng.uniform(0.3, 0.8, rng.integers(0, 3)):
         at = foot + (radius - foot) * level
         y = height * level
-        ridge = [(at, y - 0.02), (at + 0.03, y), (at, y + 0.02)]
+        ridge = [
+            (at, y - 0.02),
+            (at + 0.03, y),
+            (at, y + 0.02),
+        ]
         parts.append(turned(ridge))
-    swing = np.pi * rng.choice((0.5, rng.uniform(0.15, 0.85), -0.12))
+    swings = (0.5, rng.uniform(0.15, 0.85), -0.12)
+    swing = np.pi * rng.choice(swings)
     ear = radius + rim
     parts.append(_bail(rng, ear, height - rim / 2, swing))
     for side in (-1, 1):
@@ -162,10 +179,13 @@ def _bail(rng: Generator, ear: float, y: float, swing: float) -> Trimesh:
     turn = np.linspace(0, np.pi, 16)
     lift = ear * rng.uniform(0.85, 1.1)
     out = np.sin(turn) * lift
-    path = np.column_stack((np.cos(turn) * ear, y + np.sin(swing) * out, np.cos(swing) * out))
+    up = np.sin(swing)
+    forward = np.cos(swing)
+    path = np.column_stack((np.cos(turn) * ear, y + up * out, forward * out))
     # A lowered handle is outside the wall, at the distance of the rim.
-    across = (0, -np.cos(swing), np.sin(swing))
-    return tube(path, rng.uniform(0.018, 0.03), 8, across)
+    across = (0, -forward, up)
+    radius = rng.uniform(0.018, 0.03)
+    return tube(path, radius, 8, across)
 
 
 def goblet(rng: Generator) -> Trimesh:
@@ -184,19 +204,26 @@ def goblet(rng: Generator) -> Trimesh:
     lower = smooth(foot_profile, 12)
     is_conical = rng.random() < 0.25
     if is_conical:
-        return turned([(0, 0), *lower, (stem, rise), (wide, 1.0)])
+        cone = [(stem, rise), (wide, 1.0)]
+        return turned([(0, 0), *lower, *cone])
     mouth = rng.uniform(0.7, 1.1)
+    widest = rise + deep * rng.uniform(0.4, 0.6)
     glass = [
         (stem, rise),
         (wide * 0.75, rise + deep * 0.15),
-        (wide, rise + deep * rng.uniform(0.4, 0.6)),
+        (wide, widest),
         (wide * mouth, 1.0),
     ]
-    parts = [turned([(0.0, 0.0), *lower, *smooth(glass, 18)])]
+    upper = smooth(glass, 18)
+    parts = [turned([(0.0, 0.0), *lower, *upper])]
     if rng.random() < 0.4:
         width = stem * rng.uniform(1.6, 2.4)
         y = rise * rng.uniform(0.4, 0.8)
-        knob = [(stem, y - 0.04), (width, y), (stem, y + 0.04)]
+        knob = [
+            (stem, y - 0.04),
+            (width, y),
+            (stem, y + 0.04),
+        ]
         parts.append(turned(smooth(knob, 9), 16))
     return join(parts)
 
@@ -208,7 +235,8 @@ def teapot(rng: Generator) -> Trimesh:
     foot = radius * rng.uniform(0.5, 0.8)
     mouth = radius * rng.uniform(0.35, 0.6)
     widest = height * rng.uniform(0.3, 0.55)
-    wall = smooth([(foot, 0), (radius, widest), (mouth, height)], 18)
+    profile = [(foot, 0), (radius, widest), (mouth, height)]
+    wall = smooth(profile, 18)
     parts = named("vessel", turned([(0.0, 0.0), *wall]))
     parts += named("lid", *_lid(rng, mouth, height))
     parts += named("spout", _spout(rng, radius, height, widest))
@@ -219,7 +247,8 @@ def teapot(rng: Generator) -> Trimesh:
     else:
         top = height * rng.uniform(0.75, 0.92)
         low = height * rng.uniform(0.15, 0.35)
-        handle = _handle(wall, top, low, rng.uniform(0.28, 0.45), thick)
+        reach = rng.uniform(0.28, 0.45)
+        handle = _handle(wall, top, low, reach, thick)
     parts += named("handle", handle)
     return join(parts)
 
@@ -234,9 +263,11 @@ def _lid(rng: Generator, mouth: float, height: float) -> list[Trimesh]:
     ]
     lid = turned(smooth(profile, 8))
     radius = rng.uniform(0.045, 0.075)
-    ball_heights = height + dome + radius * 0.8 + radius * np.array((-1, -0.7, 0, 0.7, 1))
+    centre = height + dome + radius * 0.8
+    ball_heights = centre + radius * np.array((-1, -0.7, 0, 0.7, 1))
     ball_radii = radius * np.array((0, 0.7, 1, 0.7, 0))
-    knob = turned(np.column_stack((ball_radii, ball_heights)), 12)
+    ball = np.column_stack((ball_radii, ball_heights))
+    knob = turned(ball, 12)
     return [lid, knob]
 
 
@@ -244,10 +275,11 @@ def _spout(rng: Generator, radius: float, height: float, widest: float) -> Trime
     reach = rng.uniform(0.3, 0.5)
     tip = height * rng.uniform(0.85, 1.1)
     root = widest * rng.uniform(0.6, 1.0)
+    rise = tip - root
     path = [
         (-radius * 0.85, root, 0),
-        (-radius - reach * 0.45, root + (tip - root) * 0.3, 0),
-        (-radius - reach * 0.7, root + (tip - root) * 0.75, 0),
+        (-radius - reach * 0.45, root + rise * 0.3, 0),
+        (-radius - reach * 0.7, root + rise * 0.75, 0),
         (-radius - reach, tip, 0),
     ]
     wide = rng.uniform(0.09, 0.14)
@@ -260,7 +292,8 @@ def _arch(rng: Generator, wall: Array, y: float, thick: float) -> Trimesh:
     turn = np.linspace(0, np.pi, 16)
     start = _radius_at(wall, y)
     rise = y + np.sin(turn) * rng.uniform(0.5, 0.75)
-    path = np.column_stack((np.cos(turn) * start, rise, np.zeros(16)))
+    x = np.cos(turn) * start
+    path = np.column_stack((x, rise, np.zeros(16)))
     return tube(path, thick, 10, across=(0, 0, 1))
 
 
@@ -268,15 +301,20 @@ def _handle(wall: Array, top: float, low: float, reach: float, thick: float) -> 
     """Return a curved handle between two heights of a wall; on the left for negative reach."""
     # The ends are slightly inside the wall, so that there is no gap.
     inside = np.sign(reach) * 0.96
-    start = np.array((inside * _radius_at(wall, top), top, 0))
-    end = np.array((inside * _radius_at(wall, low), low, 0))
+    start_x = inside * _radius_at(wall, top)
+    end_x = inside * _radius_at(wall, low)
+    start = np.array((start_x, top, 0))
+    end = np.array((end_x, low, 0))
     turn = np.linspace(0, np.pi, 14)
     share = ((1 - np.cos(turn)) / 2)[:, None]
     path = start * (1 - share) + end * share  # half an oval
-    path[:, 0] += reach * np.sin(turn) ** 0.8
+    bulge = np.sin(turn) ** 0.8
+    path[:, 0] += reach * bulge
     return tube(path, thick, 10, across=(0, 0, 1))
 
 
 def _radius_at(wall: Array, y: float) -> float:
     """Return the radius of a wall ``(P, 2)`` at a height."""
-    return np.interp(y, wall[:, 1], wall[:, 0])
+    heights = wall[:, 1]
+    radii = wall[:, 0]
+    return np.interp(y, heights, radii)
