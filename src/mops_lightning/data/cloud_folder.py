@@ -111,7 +111,8 @@ def cloud_folder(
     folder = Path(root).expanduser()
     suffixes = MESHES if crop == "surface" else READABLE
     names = list_files(folder, suffixes)
-    class_names = choose_classes(classes, sorted({class_of(name) for name in names}))
+    known = sorted({class_of(name) for name in names})
+    class_names = choose_classes(classes, known)
     names = [name for name in names if class_of(name) in class_names]
     if test_frames == "last":
         files = [file for file in split_by_time(names, test_share, gap) if file.split]
@@ -134,7 +135,11 @@ def cloud_folder(
 
 
 def _read_meshes(
-    folder: Path, files: Sequence[SourceFile], n_points: int, seed: int, cache: str | Path | None
+    folder: Path,
+    files: Sequence[SourceFile],
+    n_points: int,
+    seed: int,
+    cache: str | Path | None,
 ) -> list[Content]:
     """Sample the surface of every mesh."""
     kept = None
@@ -154,7 +159,8 @@ def _known_numbers(contents: Sequence[Content]) -> NDArray[np.int64]:
     for content in contents:
         if content.numbers is not None:
             found.update(np.unique(content.numbers).tolist())
-    return np.array(sorted(number for number in found if number >= 0), np.int64)
+    known = [number for number in sorted(found) if number >= 0]
+    return np.array(known, np.int64)
 
 
 def _clouds_of_splits(
@@ -171,37 +177,59 @@ def _clouds_of_splits(
     """
     splits = {}
     for split in SPLITS:
-        members = [
-            (row, content) for row, content in enumerate(contents) if content.file.split == split
-        ]
-        counts = torch.tensor([len(one.clouds) for _, one in members])
-        labels = torch.tensor([class_names.index(one.file.class_name) for _, one in members])
-        sources = None
-        if counts.gt(1).any():
-            sources = torch.tensor([row for row, _ in members]).repeat_interleave(counts)
-        parts = [_parts(one.numbers, numbers) for _, one in members if one.numbers is not None]
-        sizes = torch.tensor([one.clouds.shape[1] for _, one in members])
-        differ = bool((sizes != sizes[0]).any())
-        most = int(sizes.max())
-        splits[split] = Clouds(
-            torch.cat([_repeated(one.clouds, most) for _, one in members]),
-            labels.repeat_interleave(counts),
-            sources,
-            torch.cat([_repeated(numbers, most) for numbers in parts]) if parts else None,
-            sizes.repeat_interleave(counts) if differ else None,
-        )
+        rows = []
+        members = []
+        for row, content in enumerate(contents):
+            if content.file.split == split:
+                rows.append(row)
+                members.append(content)
+        splits[split] = _joined(members, rows, class_names, numbers)
     return splits
+
+
+def _joined(
+    members: Sequence[Content],
+    rows: Sequence[int],
+    class_names: Sequence[str],
+    numbers: NDArray[np.int64] | None,
+) -> Clouds:
+    """Join the clouds of one split, whose files are the given rows among all files."""
+    counts = torch.tensor([len(content.clouds) for content in members])
+    labels = torch.tensor([class_names.index(content.file.class_name) for content in members])
+    lengths = torch.tensor([content.clouds.shape[1] for content in members])
+    most = int(lengths.max())
+    points = [_repeated(content.clouds, most) for content in members]
+    sources = None
+    if counts.gt(1).any():
+        sources = torch.tensor(rows).repeat_interleave(counts)
+    parts = None
+    numbers_of_points = [content.numbers for content in members if content.numbers is not None]
+    if numbers_of_points:
+        assert numbers is not None
+        positions = [_parts(found, numbers) for found in numbers_of_points]
+        parts = torch.cat([_repeated(position, most) for position in positions])
+    sizes = None
+    if (lengths != lengths[0]).any():
+        sizes = lengths.repeat_interleave(counts)
+    return Clouds(
+        torch.cat(points),
+        labels.repeat_interleave(counts),
+        sources,
+        parts,
+        sizes,
+    )
 
 
 def _repeated(values: Tensor, number: int) -> Tensor:
     """Return ``(crops, n, ...)`` values with rows repeated until there are ``number``."""
     own = values.shape[1]
-    return values if own == number else values[:, torch.arange(number) % own]
+    if own == number:
+        return values
+    columns = torch.arange(number) % own
+    return values[:, columns]
 
 
-def _parts(found: NDArray[np.int64], numbers: NDArray[np.int64] | None) -> Tensor:
-    """Return the position of every part number among the known ones, or ``UNKNOWN``."""
-    assert numbers is not None
+def _parts(found: NDArray[np.int64], numbers: NDArray[np.int64]) -> Tensor:
     positions = np.searchsorted(numbers, found)
     return torch.from_numpy(np.where(found < 0, UNKNOWN, positions))
 
@@ -213,7 +241,8 @@ def _fingerprint_of_meshes(
     settings = ("meshes", VERSION, n_points, seed, class_names)
     digest = hashlib.sha256(repr(settings).encode())
     for content in contents:
-        entry = (content.file.split, str(content.file.name), content.digest)
+        file = content.file
+        entry = (file.split, str(file.name), content.digest)
         digest.update(repr(entry).encode())
     return digest.hexdigest()
 
@@ -239,8 +268,6 @@ def _notes(
         missing = [name for name in class_names if name not in found]
         if missing:
             notes[f"classes_without_{split}_files"] = missing
-            print(
-                f"{folder}: no {split} file of {', '.join(missing)}: {CONSEQUENCE[split]}.",
-                file=sys.stderr,
-            )
+            names = ", ".join(missing)
+            print(f"{folder}: no {split} file of {names}: {CONSEQUENCE[split]}.", file=sys.stderr)
     return notes

@@ -53,10 +53,16 @@ class Clouds(NamedTuple):
         return Clouds(
             self.points[rows],
             self.labels[rows],
-            None if self.sources is None else self.sources[rows],
-            None if self.parts is None else self.parts[rows],
-            None if self.sizes is None else self.sizes[rows],
+            _rows_of(self.sources, rows),
+            _rows_of(self.parts, rows),
+            _rows_of(self.sizes, rows),
         )
+
+
+def _rows_of(values: Tensor | None, rows: Tensor) -> Tensor | None:
+    if values is None:
+        return None
+    return values[rows]
 
 
 @dataclass(frozen=True)
@@ -95,11 +101,13 @@ class CloudDataset:
         if channels == self.channels:
             return self
         if channels.names != self.channels.names:
-            wanted = ", ".join(channels.features)
+            wanted = ", ".join(channels.features) or "none"
             found = ", ".join(self.channels.features) or "none"
-            advice = f"Set dataset.features=[{wanted}]." if channels else "Leave features out."
+            advice = "Leave features out."
+            if channels:
+                advice = f"Set dataset.features=[{wanted}]."
             raise UserError(
-                f"{source} was trained with the features {wanted or 'none'}, but dataset.features "
+                f"{source} was trained with the features {wanted}, but dataset.features "
                 f"gives {found}. {advice}"
             )
         train = self._rescaled(self.train, channels)
@@ -109,7 +117,8 @@ class CloudDataset:
     def _rescaled(self, clouds: Clouds, channels: PointChannels) -> Clouds:
         values = self.channels.restored(clouds.points[..., 3:].double())
         scaled = channels.scaled(values).to(clouds.points.dtype)
-        return clouds._replace(points=torch.cat([clouds.points[..., :3], scaled], -1))
+        places = coordinates(clouds.points)
+        return clouds._replace(points=torch.cat([places, scaled], -1))
 
 
 def choose_classes(classes: Sequence[str] | None, known: Sequence[str]) -> tuple[str, ...]:
@@ -120,16 +129,14 @@ def choose_classes(classes: Sequence[str] | None, known: Sequence[str]) -> tuple
     """
     if not classes:
         return tuple(known)
-    if (
-        isinstance(classes, str)
-        or not isinstance(classes, Sequence)
-        or not all(isinstance(name, str) for name in classes)
-    ):
+    is_list = isinstance(classes, Sequence) and not isinstance(classes, str)
+    if not is_list or not all(isinstance(name, str) for name in classes):
         raise UserError(f"classes must be a list of names, such as [{known[0]}], got {classes!r}.")
     for name in classes:
         if name not in known:
-            raise UserError(f"classes: unknown class {name!r}.{did_you_mean(name, known)}")
-    return tuple(name for name in known if name in set(classes))
+            hint = did_you_mean(name, known)
+            raise UserError(f"classes: unknown class {name!r}.{hint}")
+    return tuple(name for name in known if name in classes)
 
 
 def make_dataset(
@@ -157,20 +164,27 @@ def make_dataset(
     """
     chosen = choose_classes(classes, known)
     n_points = splits["train"].points.shape[1]
-    digest = hashlib.sha256(repr((kind, n_points, chosen)).encode())
+    settings = (kind, n_points, chosen)
+    digest = hashlib.sha256(repr(settings).encode())
     if channels:
         digest.update(repr(channels.to_plain()).encode())
     # The new label of every class; -1 for those that are left out.
-    table = torch.tensor([chosen.index(name) if name in chosen else -1 for name in known])
+    new_labels = [chosen.index(name) if name in chosen else -1 for name in known]
+    table = torch.tensor(new_labels)
     kept = []
     for split, clouds in splits.items():
         if len(chosen) < len(known):
-            rows = table[clouds.labels] >= 0
-            clouds = clouds.take(rows)._replace(labels=table[clouds.labels[rows]])
+            labels = table[clouds.labels]
+            is_chosen = labels >= 0
+            clouds = clouds._replace(labels=labels).take(is_chosen)
         if not len(clouds.labels):
-            raise UserError(f"classes: {folder} has no {split} shape of {', '.join(chosen)}.")
-        names = [] if files is None else [list(files[split])]
-        digest.update(repr((split, *names, tuple(clouds.points.shape))).encode())
+            names_of_classes = ", ".join(chosen)
+            raise UserError(f"classes: {folder} has no {split} shape of {names_of_classes}.")
+        shape = tuple(clouds.points.shape)
+        entry: tuple[Any, ...] = (split, shape)
+        if files is not None:
+            entry = (split, list(files[split]), shape)
+        digest.update(repr(entry).encode())
         digest.update(clouds.points.numpy().data)
         digest.update(clouds.labels.numpy().data)
         if clouds.parts is not None:
@@ -185,19 +199,27 @@ def check_parts(dataset: CloudDataset) -> None:
     """Refuse points without known parts, or with too many; print the parts that a split lacks."""
     names = dataset.part_names
     if not 2 <= len(names) <= MOST_PARTS:
-        found = f"only part {names[0]}" if len(names) == 1 else len(names) or "none"
+        found: str | int = len(names) or "none"
+        if len(names) == 1:
+            found = f"only part {names[0]}"
         raise UserError(
             f"dataset: its points must belong to 2 to {MOST_PARTS} parts, got {found}. Give "
             "dataset=shapes dataset.classes=parts, or your own clouds with dataset.label=COLUMN."
         )
-    for split, parts in (("training", dataset.train.parts), ("test", dataset.test.parts)):
+    parts_of_splits = (
+        ("training", dataset.train.parts),
+        ("test", dataset.test.parts),
+    )
+    for split, parts in parts_of_splits:
         assert parts is not None
-        counts = torch.bincount(parts[parts != UNKNOWN], minlength=len(names)).tolist()
+        known = parts[parts != UNKNOWN]
+        counts = torch.bincount(known, minlength=len(names)).tolist()
         if not any(counts):
             raise UserError(f"dataset.label: no {split} point has a known part, 0 or more.")
-        missing = ", ".join(name for name, count in zip(names, counts, strict=True) if not count)
+        missing = [name for name, count in zip(names, counts, strict=True) if count == 0]
         if missing:
-            print(f"dataset: no {split} point of part {missing:.200}.", file=sys.stderr)
+            text = ", ".join(missing)
+            print(f"dataset: no {split} point of part {text:.200}.", file=sys.stderr)
 
 
 def noisy(clouds: Clouds, noise: float) -> Clouds:
@@ -213,16 +235,19 @@ def noisy(clouds: Clouds, noise: float) -> Clouds:
     if not noise:
         return clouds
     points = coordinates(clouds.points)
-    drawn = [
-        torch.randn(points.shape[1:], generator=generator(NOISE, s)) for s in range(len(points))
-    ]
+    shape = points.shape[1:]
+    drawn = []
+    for number in range(len(points)):
+        rng = generator(NOISE, number)
+        drawn.append(torch.randn(shape, generator=rng))
     moved = points + noise * torch.stack(drawn)
     return clouds._replace(points=with_coordinates(clouds.points, moved))
 
 
 def scale_warning(dataset: CloudDataset) -> str | None:
     """Return one line about training clouds far from the unit sphere, else None."""
-    radius = coordinates(dataset.train.points).norm(dim=2).amax(1).median().item()
+    distances = coordinates(dataset.train.points).norm(dim=2)
+    radius = distances.amax(1).median().item()
     if 0.5 <= radius <= 2:
         return None
     return (

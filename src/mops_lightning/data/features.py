@@ -39,7 +39,8 @@ def check_features(features: Any) -> tuple[str, ...]:
     """
     if not features:
         return ()
-    if isinstance(features, str) or not all(isinstance(name, str) for name in features):
+    is_list = not isinstance(features, str)
+    if not is_list or not all(isinstance(name, str) for name in features):
         raise UserError(
             f"features must be a list of names, such as [intensity, normals], got {features!r}."
         )
@@ -59,7 +60,11 @@ def check_features(features: Any) -> tuple[str, ...]:
 
 
 def feature_values(
-    table: Table, features: Sequence[str], path: Path, setting: str, estimates: bool = True
+    table: Table,
+    features: Sequence[str],
+    path: Path,
+    setting: str,
+    estimates: bool = True,
 ) -> Values:
     """Return the features of a file's points.
 
@@ -94,12 +99,16 @@ def find_name(table: Table, name: str) -> str | None:
     if name in table.columns:
         return name
     same = [other for other in table.columns if other.lower() == name.lower()]
-    return same[0] if len(same) == 1 else None
+    if len(same) == 1:
+        return same[0]
+    return None
 
 
 def stored_names(table: Table, feature: str) -> tuple[str, ...]:
     """Return the names of a feature's columns in a file; empty if it has none."""
-    groups = STORED_NORMALS if feature == NORMALS else ((feature,),)
+    groups: tuple[tuple[str, ...], ...] = ((feature,),)
+    if feature == NORMALS:
+        groups = STORED_NORMALS
     for group in groups:
         found = [find_name(table, name) for name in group]
         names = tuple(name for name in found if name is not None)
@@ -116,7 +125,8 @@ def stored_values(table: Table, feature: str) -> Values | None:
     names = stored_names(table, feature)
     if not names:
         return None
-    values = np.stack([np.asarray(table.columns[name], np.float64) for name in names], axis=1)
+    columns = [np.asarray(table.columns[name], np.float64) for name in names]
+    values = np.stack(columns, axis=1)
     if feature == NORMALS:
         lengths = np.linalg.norm(values, axis=1, keepdims=True)
         values = np.divide(values, lengths, out=values, where=lengths > 0)
@@ -139,12 +149,15 @@ def _missing(table: Table, name: str, features: Sequence[str], path: Path, setti
             "file at once, not from chunks."
         )
     hint = did_you_mean(name, [*table.columns, *ESTIMATED])
-    wanted = "" if len(features) == 1 else f" of {', '.join(features)}"
+    wanted = ""
+    if len(features) > 1:
+        wanted = f" of {', '.join(features)}"
     return f"{setting}: {path} has no column {name!r}{wanted}.{hint}"
 
 
 def _check_finite(values: Values, name: str, path: Path, setting: str) -> None:
-    number = int((~np.isfinite(values).all(1)).sum())
+    is_finite = np.isfinite(values).all(1)
+    number = int((~is_finite).sum())
     if number:
         raise BadCloudError(
             f"{setting}: {number} of {len(values)} points of {path} have no finite {name}. Remove "
@@ -165,19 +178,22 @@ def channels_of(features: Sequence[str], training: Iterable[Values]) -> PointCha
     """
     if not features:
         return NO_CHANNELS
-    rows = np.concatenate([values.reshape(-1, values.shape[-1]) for values in training])
+    flat = [values.reshape(-1, values.shape[-1]) for values in training]
+    rows = np.concatenate(flat)
     columns: list[Channel] = []
     for name in features:
         if name == NORMALS:
             columns += [Channel(part) for part in NORMAL_COLUMNS]
             continue
         values = rows[:, len(columns)]
+        mean = float(values.mean())
         spread = float(values.std())
-        columns.append(Channel(name, float(values.mean()), spread if spread > 0 else 1.0))
+        columns.append(Channel(name, mean, spread if spread > 0 else 1.0))
     return PointChannels(columns)
 
 
 def with_channels(points: Tensor, values: Values, channels: PointChannels) -> Tensor:
     """Return points ``(..., 3)`` followed by scaled features ``(..., C)``, in float32."""
-    scaled = channels.scaled(torch.from_numpy(values)).to(points.dtype)
+    scaled = channels.scaled(torch.from_numpy(values))
+    scaled = scaled.to(points.dtype)
     return torch.cat([points, scaled], -1)

@@ -35,10 +35,15 @@ def hdf5(
         UserError: an argument or a file is invalid.
     """
     folder = Path(root).expanduser()
-    known = read_names(folder / NAMES) if (folder / NAMES).is_file() else None
+    file_of_names = folder / NAMES
+    known = None
+    n_classes = None
+    if file_of_names.is_file():
+        known = read_names(file_of_names)
+        n_classes = len(known)
     splits = {
-        split: read_clouds(folder / f"{split}.h5", n_points, None if known is None else len(known))
-        for split in ("train", "test")
+        "train": read_clouds(folder / "train.h5", n_points, n_classes),
+        "test": read_clouds(folder / "test.h5", n_points, n_classes),
     }
     if known is None:
         highest = max(int(clouds.labels.max()) for clouds in splits.values())
@@ -53,7 +58,8 @@ def read_names(path: Path) -> list[str]:
         UserError: the file cannot be read, is empty or lists a class twice.
     """
     names = read_lines(path)
-    if not names or len(set(names)) != len(names):
+    is_each_once = len(set(names)) == len(names)
+    if not names or not is_each_once:
         raise UserError(f"{path} must list each class once, one per line.")
     return names
 
@@ -86,52 +92,66 @@ def read_clouds(path: Path, n_points: int, n_classes: int | None) -> Clouds:
     with reading(path), h5py.File(path, "r") as file:
         data = _dataset(path, file, "data")
         label = _dataset(path, file, "label")
-        if (
-            data.ndim != 3
-            or data.shape[2] != 3
-            or label.shape not in ((len(data),), (len(data), 1))
-            or data.dtype.kind + label.dtype.kind not in ("fu", "fi")
-        ):
+        if not _are_clouds(data, label):
             raise UserError(
                 f"{path} must contain data (S, N, 3) of floats and label (S, 1) or (S,) of "
                 f"integers, got {data.shape} {data.dtype} and {label.shape} {label.dtype}."
             )
-        if data.shape[1] < n_points:
+        number, size, _ = data.shape
+        if size < n_points:
             raise UserError(
-                f"n_points must be at most {data.shape[1]}, the points per shape in {path}, "
-                f"got {n_points}."
+                f"n_points must be at most {size}, the points per shape in {path}, got {n_points}."
             )
-        if not len(data):
+        if number == 0:
             raise UserError(f"{path} contains no shapes.")
-        if len(data) * n_points * 3 * data.dtype.itemsize > memory(path):
+        wanted_bytes = number * n_points * 3 * data.dtype.itemsize
+        if wanted_bytes > memory(path):
             raise UserError(
-                f"{path} announces {len(data):,} shapes, much more than its "
+                f"{path} announces {number:,} shapes, much more than its "
                 f"{path.stat().st_size:,} bytes hold. Replace it by an intact copy."
             )
         with np.errstate(over="ignore"):  # overflows are detected below
-            points = np.asarray(data[:, :n_points], dtype=np.float32)
+            first_points = data[:, :n_points]
+            points = np.asarray(first_points, dtype=np.float32)
         labels = np.asarray(label[()], dtype=np.int64).reshape(-1)
     if not np.isfinite(points).all():
         raise UserError(f"{path} contains NaN or infinite values. Replace it by an intact copy.")
     low = labels.min()
     high = labels.max()
-    allowed = MAX_CLASSES if n_classes is None else n_classes
+    allowed = n_classes
+    reason = f"as {NAMES} lists {n_classes} classes"
+    if allowed is None:
+        allowed = MAX_CLASSES
+        reason = f"without {NAMES}"
     if low < 0 or high >= allowed:
-        reason = (
-            f"without {NAMES}" if n_classes is None else f"as {NAMES} lists {n_classes} classes"
-        )
         raise UserError(
             f"{path} must have labels from 0 to {allowed - 1}, {reason}, got {low} to {high}."
         )
     return Clouds(torch.from_numpy(points), torch.from_numpy(labels))
 
 
+def _are_clouds(data: h5py.Dataset, label: h5py.Dataset) -> bool:
+    if data.ndim != 3 or data.shape[2] != 3:
+        return False
+    number = data.shape[0]
+    is_one_each = label.shape in ((number,), (number, 1))
+    return is_one_each and data.dtype.kind == "f" and label.dtype.kind in "ui"
+
+
 def _dataset(path: Path, file: h5py.File, key: str) -> h5py.Dataset:
     """Return a dataset whose numbers are in the file itself, not in another one."""
-    linked = key in file and not isinstance(file.get(key, getlink=True), h5py.HardLink)
-    found = None if linked else file.get(key)
-    if linked or (isinstance(found, h5py.Dataset) and (found.is_virtual or found.external)):
+    found = None
+    refers_elsewhere = False
+    if key in file:
+        link = file.get(key, getlink=True)
+        refers_elsewhere = not isinstance(link, h5py.HardLink)
+    if not refers_elsewhere:
+        found = file.get(key)
+    if isinstance(found, h5py.Dataset) and (found.is_virtual or found.external):
+        refers_elsewhere = True
+    if refers_elsewhere:
         raise UserError(f"{path}: dataset {key!r} refers to other files, which is not accepted.")
     if not isinstance(found, h5py.Dataset):
-        raise UserError(f"{path} has no dataset {key!r}; it contains {sorted(file)[:20]}.")
+        names = sorted(file)[:20]
+        raise UserError(f"{path} has no dataset {key!r}; it contains {names}.")
     return found

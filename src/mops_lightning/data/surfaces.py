@@ -47,20 +47,29 @@ def sample_surface(
         data = path.read_bytes()
     digest = hashlib.sha256(data).hexdigest()
     key = repr((VERSION, digest, path.suffix.lower(), n_points, seed))
-    kept = cache / f"{hashlib.sha256(key.encode()).hexdigest()}.npz" if cache else None
+    kept = None
+    if cache:
+        name = hashlib.sha256(key.encode()).hexdigest()
+        kept = cache / f"{name}.npz"
 
     def sample() -> list[NDArray[np.float32]]:
-        random = np.random.default_rng([seed, int(digest[:16], 16)])
+        seed_of_file = int(digest[:16], 16)
+        random = np.random.default_rng([seed, seed_of_file])
         from mops_lightning.data.formats.mesh import sample_mesh  # imports the readers
 
         points = sample_mesh(path, data, n_points, random).points
-        return [UnitSphere.around(points).normalise(points).numpy()]
+        sphere = UnitSphere.around(points)
+        return [sphere.normalise(points).numpy()]
 
-    return digest, torch.from_numpy(cached(kept, [((n_points, 3), FLOAT)], sample)[0])
+    kinds = [((n_points, 3), FLOAT)]
+    (points,) = cached(kept, kinds, sample)
+    return digest, torch.from_numpy(points)
 
 
 def cached(
-    path: Path | None, kinds: Sequence[Kind], make: Callable[[], list[NDArray[Any]]]
+    path: Path | None,
+    kinds: Sequence[Kind],
+    make: Callable[[], list[NDArray[Any]]],
 ) -> list[NDArray[Any]]:
     """Return clouds, and perhaps their parts, from a cache file, or make them and write the file.
 
@@ -78,7 +87,8 @@ def cached(
         arrays = list(load_npz(path).values())  # verifies the checksums of the arrays
     except UserError:
         arrays = []
-    if [(array.shape, array.dtype) for array in arrays] == list(kinds):
+    found = [(array.shape, array.dtype) for array in arrays]
+    if found == list(kinds):
         return arrays
     arrays = make()
     try:

@@ -43,7 +43,10 @@ class Area:
 
     @classmethod
     def parse(
-        cls, bounds: str | None, level: int | None, resolution: float | None
+        cls,
+        bounds: str | None,
+        level: int | None,
+        resolution: float | None,
     ) -> "Area | None":
         """Return the area of the options of a command line; None without any.
 
@@ -54,19 +57,25 @@ class Area:
         """
         if bounds is None:
             levels = cls(level=level, resolution=resolution)
-            return None if levels == cls() else levels
+            if levels == cls():
+                return None
+            return levels
         numbers: list[float] = []
         with suppress(ValueError):
             numbers = [float(word) for word in bounds.split(",")]
         half = len(numbers) // 2
-        low, high = numbers[:half], numbers[half:]
-        if len(numbers) not in (4, 6) or not all(a < b for a, b in zip(low, high, strict=True)):
+        low = numbers[:half]
+        high = numbers[half:]
+        has_length = len(numbers) in (4, 6)
+        if not has_length or not _are_below(low, high):
             raise UserError(
                 "--bounds must be xmin,ymin,xmax,ymax or xmin,ymin,zmin,xmax,ymax,zmax with every "
                 f"min below its max, got {bounds!r}."
             )
-        flat = half == 2
-        return cls((*low, *[-inf] * flat), (*high, *[inf] * flat), level, resolution)
+        if half == 2:
+            low.append(-inf)
+            high.append(inf)
+        return cls(tuple(low), tuple(high), level, resolution)
 
     def clip(self, table: Table, path: Path) -> Table:
         """Return the points of a file that are in the box.
@@ -79,5 +88,12 @@ class Area:
                 f"{path}: --level and --resolution need a COPC file, which has levels of detail. "
                 "Use --bounds alone, or --method voxel."
             )
-        inside = ((table.points >= self.low) & (table.points <= self.high)).all(axis=1)
-        return table if inside.all() else table.take(np.flatnonzero(inside))
+        is_inside = (table.points >= self.low) & (table.points <= self.high)
+        rows = is_inside.all(axis=1)
+        if rows.all():
+            return table
+        return table.take(np.flatnonzero(rows))
+
+
+def _are_below(low: list[float], high: list[float]) -> bool:
+    return all(least < most for least, most in zip(low, high, strict=True))

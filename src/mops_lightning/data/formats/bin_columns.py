@@ -11,7 +11,8 @@ def parse_columns(text: str) -> tuple[str, ...]:
     Raises:
         UserError: a name is missing or there twice.
     """
-    return check_columns("--columns", [name.strip() for name in text.split(",")])
+    names = [name.strip() for name in text.split(",")]
+    return check_columns("--columns", names)
 
 
 def check_columns(setting: str, names: Sequence[str]) -> tuple[str, ...]:
@@ -26,8 +27,11 @@ def check_columns(setting: str, names: Sequence[str]) -> tuple[str, ...]:
     """
     is_list = not isinstance(names, str) and all(isinstance(name, str) for name in names)
     is_complete = is_list and {"x", "y", "z"} <= set(names) and "" not in names
-    if not is_complete or len(set(names)) < len(names):
-        got = names if isinstance(names, str) else ",".join(map(str, names))
+    is_each_once = len(set(names)) == len(names)
+    if not is_complete or not is_each_once:
+        got = names
+        if not isinstance(names, str):
+            got = ",".join(map(str, names))
         raise UserError(
             f"{setting} must name all columns of a .bin file, each once, with x, y and z among "
             f"them, such as x,y,z,intensity,ring; got {got!r}."

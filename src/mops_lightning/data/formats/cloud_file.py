@@ -38,7 +38,11 @@ class CloudFile:
     def row_ranges(self, size: int) -> list[range]:
         """Split the rows into ranges of up to ``size``."""
         starts = range(0, self.number, size)
-        return [range(start, min(start + size, self.number)) for start in starts]
+        ranges = []
+        for start in starts:
+            stop = min(start + size, self.number)
+            ranges.append(range(start, stop))
+        return ranges
 
     def read(self, rows: range) -> Table:
         """Read a range of rows, without the points that are not finite or outside of the area.
@@ -51,7 +55,9 @@ class CloudFile:
             if len(table.points) < len(rows):
                 raise ends_early(self.path, rows.start + len(table.points))
             table = table.finite()
-            return table if self.area is None else self.area.clip(table, self.path)
+            if self.area is None:
+                return table
+            return self.area.clip(table, self.path)
 
     def read_all(self) -> Table:
         """Read all rows, range by range; see ``read``."""
@@ -73,7 +79,8 @@ def binary_file(path: Path, number: int, kind: np.dtype[Any], offset: int = 0) -
     """
     if not kind.itemsize or number < 0:
         raise BadCloudError(f"{path} is broken: {number} points of {kind}.")
-    room = max(path.stat().st_size - offset, 0) // kind.itemsize
+    available = max(path.stat().st_size - offset, 0)
+    room = available // kind.itemsize
     if number > room:
         raise ends_early(path, room)
     return CloudFile(path, number, partial(_parse_rows, kind, offset))
@@ -81,4 +88,5 @@ def binary_file(path: Path, number: int, kind: np.dtype[Any], offset: int = 0) -
 
 def _parse_rows(kind: np.dtype[Any], offset: int, path: Path, rows: range) -> Table:
     start = offset + rows.start * kind.itemsize
-    return from_array(np.fromfile(path, kind, len(rows), offset=start), path)
+    numbers = np.fromfile(path, kind, len(rows), offset=start)
+    return from_array(numbers, path)

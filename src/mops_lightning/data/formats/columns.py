@@ -1,6 +1,6 @@
 """Columns of a table: from the arrays of a file, and to rows of types that a format has."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +58,11 @@ def _check_coordinates(name: str, column: Column, path: Path) -> None:
         raise BadCloudError(f"{path}: {name} must be numbers, got {kind}.")
     if not holds_exactly(np.dtype(np.float64), column):
         raise BadCloudError(f"{path}: {name} has numbers that float64 does not hold exactly.")
+
+
+def common_names(parts: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the names that all parts have, in the order of the first."""
+    return [name for name in parts[0] if all(name in part for part in parts)]
 
 
 def is_number_column(column: Column) -> bool:

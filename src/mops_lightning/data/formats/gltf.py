@@ -10,12 +10,27 @@ from numpy.typing import NDArray
 
 from mops_lightning.data.formats.guard import BadCloudError
 
-KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+KINDS = {
+    5120: "i1",
+    5121: "u1",
+    5122: "<i2",
+    5123: "<u2",
+    5125: "<u4",
+    5126: "<f4",
+}
 """Data types of accessors by their number."""
 
 FLOAT = 5126
 
-WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+WIDTHS = {
+    "SCALAR": 1,
+    "VEC2": 2,
+    "VEC3": 3,
+    "VEC4": 4,
+    "MAT2": 4,
+    "MAT3": 9,
+    "MAT4": 16,
+}
 """How many numbers an item of an accessor has."""
 
 SURFACE = ("POSITION", "NORMAL")
@@ -40,16 +55,20 @@ def plain_glb(data: bytes, path: Path) -> bytes:
     _check_extensions(tree, path)
     accessors = tree.get("accessors", [])
     quantised = _quantised(tree)
-    changed = {place for place, accessor in enumerate(accessors) if "sparse" in accessor}
-    changed |= quantised
+    changed = set(quantised)
+    for place, accessor in enumerate(accessors):
+        if "sparse" in accessor:
+            changed.add(place)
     if not changed:
         return data
     extended = bytearray(buffer)
     for place in sorted(changed):
-        numbers = _numbers(tree, buffer, accessors[place])
+        accessor = accessors[place]
+        numbers = _numbers(tree, buffer, accessor)
         if place in quantised:
-            numbers = _dequantised(numbers, bool(accessors[place].get("normalized")))
-        accessors[place] = _append(tree, extended, accessors[place], numbers)
+            is_normalised = bool(accessor.get("normalized"))
+            numbers = _dequantised(numbers, is_normalised)
+        accessors[place] = _append(tree, extended, accessor, numbers)
     return _packed(tree, bytes(extended))
 
 
@@ -80,10 +99,12 @@ def _quantised(tree: dict[str, Any]) -> set[int]:
     for mesh in tree.get("meshes", []):
         for primitive in mesh.get("primitives", []):
             for name in SURFACE:
-                place = primitive.get("attributes", {}).get(name)
+                attributes = primitive.get("attributes", {})
+                place = attributes.get(name)
                 if place is None:
                     continue
-                if tree["accessors"][place]["componentType"] != FLOAT:
+                accessor = tree["accessors"][place]
+                if accessor["componentType"] != FLOAT:
                     found.add(place)
     return found
 
@@ -91,10 +112,12 @@ def _quantised(tree: dict[str, Any]) -> set[int]:
 def _numbers(tree: dict[str, Any], buffer: bytes, accessor: dict[str, Any]) -> NDArray[Any]:
     """Return the items ``(count, width)`` of an accessor."""
     kind = np.dtype(KINDS[accessor["componentType"]])
-    width, count = WIDTHS[accessor["type"]], accessor["count"]
+    width = WIDTHS[accessor["type"]]
+    count = accessor["count"]
     if "bufferView" in accessor:
+        view = accessor["bufferView"]
         offset = accessor.get("byteOffset", 0)
-        numbers = _items(tree, buffer, accessor["bufferView"], offset, kind, count, width)
+        numbers = _items(tree, buffer, view, offset, kind, count, width)
     elif count * width * kind.itemsize > len(buffer):
         raise ValueError(f"an accessor without data has {count} items")
     else:
@@ -102,13 +125,17 @@ def _numbers(tree: dict[str, Any], buffer: bytes, accessor: dict[str, Any]) -> N
     sparse = accessor.get("sparse")
     if sparse is None:
         return numbers
-    places, values = sparse["indices"], sparse["values"]
-    place_kind, number = np.dtype(KINDS[places["componentType"]]), sparse["count"]
+    places = sparse["indices"]
+    values = sparse["values"]
+    number = sparse["count"]
+    place_kind = np.dtype(KINDS[places["componentType"]])
+    view = places["bufferView"]
     offset = places.get("byteOffset", 0)
-    rows = _items(tree, buffer, places["bufferView"], offset, place_kind, number, 1)[:, 0]
+    rows = _items(tree, buffer, view, offset, place_kind, number, 1)[:, 0]
+    view = values["bufferView"]
     offset = values.get("byteOffset", 0)
     numbers = numbers.copy()
-    numbers[rows] = _items(tree, buffer, values["bufferView"], offset, kind, number, width)
+    numbers[rows] = _items(tree, buffer, view, offset, kind, number, width)
     return numbers
 
 
@@ -126,8 +153,9 @@ def _items(
     if view.get("buffer", 0) != 0:
         raise ValueError("it has several buffers")
     start = view.get("byteOffset", 0) + offset
-    step = view.get("byteStride") or kind.itemsize * width
-    end = start + step * (count - 1) + kind.itemsize * width
+    size = kind.itemsize * width
+    step = view.get("byteStride") or size
+    end = start + step * (count - 1) + size
     if min(start, step, count) < 0 or end > len(buffer):
         raise ValueError("an accessor ends after the buffer")
     strides = (step, kind.itemsize)
@@ -139,19 +167,26 @@ def _dequantised(numbers: NDArray[Any], normalised: bool) -> NDArray[np.float32]
     if not normalised or numbers.dtype.kind == "f":
         return numbers.astype(np.float32)
     largest = np.iinfo(numbers.dtype).max
-    return np.maximum(numbers / largest, -1).astype(np.float32)
+    shares = np.maximum(numbers / largest, -1)
+    return shares.astype(np.float32)
 
 
 def _append(
-    tree: dict[str, Any], buffer: bytearray, accessor: dict[str, Any], numbers: NDArray[Any]
+    tree: dict[str, Any],
+    buffer: bytearray,
+    accessor: dict[str, Any],
+    numbers: NDArray[Any],
 ) -> dict[str, Any]:
     """Append numbers to the buffer, and return their accessor."""
     buffer += bytes(-len(buffer) % 4)
     start = len(buffer)
     buffer += numbers.tobytes()
-    tree["bufferViews"].append(
-        {"buffer": 0, "byteOffset": start, "byteLength": len(buffer) - start}
-    )
+    view = {
+        "buffer": 0,
+        "byteOffset": start,
+        "byteLength": len(buffer) - start,
+    }
+    tree["bufferViews"].append(view)
     left = ("sparse", "byteOffset", "min", "max")
     plain = {key: value for key, value in accessor.items() if key not in left}
     plain["bufferView"] = len(tree["bufferViews"]) - 1
@@ -166,6 +201,8 @@ def _packed(tree: dict[str, Any], buffer: bytes) -> bytes:
     text = json.dumps(tree).encode()
     text += b" " * (-len(text) % 4)
     buffer += bytes(-len(buffer) % 4)
-    parts = struct.pack("<I", len(text)) + b"JSON" + text
-    parts += struct.pack("<I", len(buffer)) + b"BIN\0" + buffer
-    return b"glTF" + struct.pack("<II", 2, 12 + len(parts)) + parts
+    text_head = struct.pack("<I", len(text)) + b"JSON"
+    buffer_head = struct.pack("<I", len(buffer)) + b"BIN\0"
+    chunks = text_head + text + buffer_head + buffer
+    head = b"glTF" + struct.pack("<II", 2, 12 + len(chunks))
+    return head + chunks

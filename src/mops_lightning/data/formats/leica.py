@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mops_lightning.data.formats.columns import common_names
 from mops_lightning.data.formats.guard import BadCloudError
 from mops_lightning.data.formats.table import Column, Form, Table
 from mops_lightning.data.formats.text import numbers_of_lines
@@ -33,9 +34,10 @@ def read_pts(path: Path) -> Table:
     rows = [line for line in lines if not line.isdecimal()]
     if not rows:
         raise BadCloudError(f"{path} holds no points.")
-    if counts and sum(counts) != len(rows):
+    announced = sum(counts)
+    if counts and announced != len(rows):
         raise BadCloudError(
-            f"{path} is broken: it announces {sum(counts)} points, but has {len(rows)}."
+            f"{path} is broken: it announces {announced} points, but has {len(rows)}."
         )
     values = numbers_of_lines(rows, None)
     if len(values) not in PTS_COLUMNS:
@@ -44,8 +46,10 @@ def read_pts(path: Path) -> Table:
             "a line."
         )
     points = np.stack(values[:3], 1).astype(np.float64)
-    columns = dict(zip(PTS_COLUMNS[len(values)], values[3:], strict=True))
-    return Table(points, columns, form=Form(np.dtype(np.float64)))
+    names = PTS_COLUMNS[len(values)]
+    columns = dict(zip(names, values[3:], strict=True))
+    form = Form(np.dtype(np.float64))
+    return Table(points, columns, form=form)
 
 
 def read_ptx(path: Path) -> Table:
@@ -64,9 +68,12 @@ def read_ptx(path: Path) -> Table:
         head = lines[start : start + PTX_HEADER]
         if len(head) < PTX_HEADER:
             raise BadCloudError(f"{path} is broken: it ends in the header of a scan.")
-        number = int(head[0]) * int(head[1])
+        width = int(head[0])
+        height = int(head[1])
+        number = width * height
         matrix = np.array([line.split() for line in head[6:]], np.float64)
-        body = lines[start + PTX_HEADER : start + PTX_HEADER + max(number, 0)]
+        first = start + PTX_HEADER
+        body = lines[first : first + max(number, 0)]
         if number < 1 or len(body) < number:
             raise BadCloudError(
                 f"{path} is broken: it announces {number} points, but has {len(body)}."
@@ -77,17 +84,21 @@ def read_ptx(path: Path) -> Table:
                 f"{path} is broken: a point has x y z, intensity and perhaps red green blue, got "
                 f"{len(values)} numbers."
             )
-        points.append(_posed(np.stack(values[:3], 1).astype(np.float64), matrix))
-        columns.append(dict(zip(PTS_COLUMNS[len(values)], values[3:], strict=True)))
-        start += PTX_HEADER + number
+        seen = np.stack(values[:3], 1).astype(np.float64)
+        points.append(_posed(seen, matrix))
+        names_of_scan = PTS_COLUMNS[len(values)]
+        columns.append(dict(zip(names_of_scan, values[3:], strict=True)))
+        start = first + number
     if not points:
         raise BadCloudError(f"{path} is empty.")
-    names = [name for name in columns[0] if all(name in scan for scan in columns)]
+    names = common_names(columns)
     joined = {name: np.concatenate([scan[name] for scan in columns]) for name in names}
     if len(points) > 1:
         lengths = [len(scan) for scan in points]
-        joined["scan"] = np.repeat(np.arange(len(points), dtype=np.uint16), lengths)
-    left_out = sorted({name for scan in columns for name in scan}.difference(names))
+        numbers = np.arange(len(points), dtype=np.uint16)
+        joined["scan"] = np.repeat(numbers, lengths)
+    known = {name for scan in columns for name in scan}
+    left_out = sorted(known.difference(names))
     form = Form(np.dtype(np.float64), left_out=tuple(left_out))
     return Table(np.concatenate(points), joined, form=form)
 
@@ -101,6 +112,8 @@ def _lines(path: Path) -> list[str]:
 def _posed(points: NDArray[np.float64], matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return points in the frame of the project; the matrix multiplies rows ``(x, y, z, 1)``."""
     empty = (points == 0).all(axis=1)
-    posed = points @ matrix[:3, :3] + matrix[3, :3]
+    rotation = matrix[:3, :3]
+    translation = matrix[3, :3]
+    posed = points @ rotation + translation
     posed[empty] = np.nan
     return posed

@@ -56,7 +56,8 @@ def _sample(path: Path, data: bytes, number: int, seed: int | np.random.Generato
     points, faces = sample_surface(mesh, number, seed=seed)
     exact = np.asarray(points, np.float64)
     columns = attributes(mesh, exact, np.asarray(faces))
-    return Table(exact, columns, form=Form(left_out=mesh.metadata.get(LEFT_OUT, ())))
+    form = Form(left_out=mesh.metadata.get(LEFT_OUT, ()))
+    return Table(exact, columns, form=form)
 
 
 def mesh_vertices(path: Path, data: bytes) -> Table:
@@ -73,8 +74,11 @@ def mesh_vertices(path: Path, data: bytes) -> Table:
 def _parse_vertices(path: Path, data: bytes) -> Table:
     mesh = parse_mesh(data, path)
     left_out = (*mesh.metadata.get(LEFT_OUT, ()), "faces")
-    columns = {name: np.asarray(column) for name, column in mesh.vertex_attributes.items()}
-    return Table(np.asarray(mesh.vertices, np.float64), columns, form=Form(left_out=left_out))
+    columns = {}
+    for name, column in mesh.vertex_attributes.items():
+        columns[name] = np.asarray(column)
+    points = np.asarray(mesh.vertices, np.float64)
+    return Table(points, columns, form=Form(left_out=left_out))
 
 
 def parse_mesh(data: bytes, path: Path) -> "Trimesh":
@@ -94,7 +98,8 @@ def parse_mesh(data: bytes, path: Path) -> "Trimesh":
     """
     kind = path.suffix.lower()
     if kind not in SUFFIXES:
-        raise BadCloudError(f"{path} must end in {', '.join(SUFFIXES)}.")
+        suffixes = ", ".join(SUFFIXES)
+        raise BadCloudError(f"{path} must end in {suffixes}.")
     if not data.strip():
         raise BadCloudError(f"{path} is empty.")
     area = 0.0
@@ -105,7 +110,8 @@ def parse_mesh(data: bytes, path: Path) -> "Trimesh":
         if len(faces):
             area = float(mesh.area)
         if area:
-            extent = float(np.ptp(mesh.triangles, axis=(0, 1)).max())
+            extents = np.ptp(mesh.triangles, axis=(0, 1))
+            extent = float(extents.max())
     if not len(faces):
         raise BadCloudError(f"{path} has no faces, so there is no surface to sample.")
     announced = _announced_faces(data, kind)
@@ -124,10 +130,11 @@ def _checked_faces(mesh: "Trimesh") -> NDArray[np.int64]:
     Raises:
         ValueError: vertices have not three coordinates, or a face has no such vertex.
     """
-    if mesh.vertices.shape[1] != 3:
-        raise ValueError(f"vertices must have 3 coordinates, got {mesh.vertices.shape[1]}")
+    number, width = mesh.vertices.shape
+    if width != 3:
+        raise ValueError(f"vertices must have 3 coordinates, got {width}")
     faces = np.asarray(mesh.faces).reshape(-1, 3)
-    if len(faces) and not 0 <= faces.min() <= faces.max() < len(mesh.vertices):
+    if len(faces) and not 0 <= faces.min() <= faces.max() < number:
         raise ValueError("a face refers to a vertex that does not exist")
     return faces
 
@@ -152,7 +159,8 @@ def _load(data: bytes, kind: str, path: Path) -> "Trimesh":
     joined.vertex_attributes.update(of_scene.of_vertices)
     joined.face_attributes.clear()
     joined.face_attributes.update(of_scene.of_faces)
-    joined.metadata[LEFT_OUT] = (*_left_out(data, kind), *of_scene.left_out)
+    left_out = _left_out(data, kind)
+    joined.metadata[LEFT_OUT] = (*left_out, *of_scene.left_out)
     return joined
 
 

@@ -35,7 +35,8 @@ class NpzForm:
 
 def read_npy(path: Path) -> Table:
     """Read one array: ``(N, K)`` numbers, x, y and z first, or ``(N,)`` rows of named fields."""
-    return from_array(np.load(path, allow_pickle=False), path)
+    array = np.load(path, allow_pickle=False)
+    return from_array(array, path)
 
 
 def write_npy(path: Path, table: Table) -> list[str]:
@@ -52,7 +53,8 @@ def write_npy(path: Path, table: Table) -> list[str]:
     is_plain = all(holds_exactly(kind, column) for column in columns.values())
     with path.open("wb") as file:
         if is_plain:
-            array = np.empty((len(points), len(columns)), kind)
+            shape = (len(points), len(columns))
+            array = np.empty(shape, kind)
             for number, column in enumerate(columns.values()):
                 array[:, number] = column
             np.save(file, array)
@@ -65,7 +67,8 @@ def _lost_names(table: Table) -> list[str]:
     """Return a note of the names of columns that a plain array does not hold."""
     if all(name.startswith("column_") for name in table.columns):
         return []
-    return [f"its columns are x, y, z, {', '.join(table.columns)}, without names in the file"]
+    names = ", ".join(table.columns)
+    return [f"its columns are x, y, z, {names}, without names in the file"]
 
 
 def locate_npy(path: Path) -> CloudFile:
@@ -124,19 +127,23 @@ def _name_of_points(arrays: dict[str, NDArray[Any]], path: Path) -> str:
             return name
     if len(arrays) == 1:
         return next(iter(arrays))
-    raise BadCloudError(f"{path} has no array named points, got {', '.join(arrays) or 'none'}.")
+    names = ", ".join(arrays) or "none"
+    raise BadCloudError(f"{path} has no array named points, got {names}.")
 
 
 def _is_attribute(array: NDArray[Any], number: int) -> bool:
     """Return whether an array has one or several numbers per point."""
-    return array.dtype.kind in "fiub" and array.ndim in (1, 2) and len(array) == number
+    is_number = array.dtype.kind in "fiub"
+    return is_number and array.ndim in (1, 2) and len(array) == number
 
 
 def write_npz(path: Path, table: Table) -> None:
     """Write the points, and one array for every column or array of columns."""
-    layout = table.form.layout
-    form = layout if isinstance(layout, NpzForm) else NpzForm()
-    arrays: dict[str, NDArray[Any]] = {form.points: table.stored_coordinates()}
+    form = table.form.layout
+    if not isinstance(form, NpzForm):
+        form = NpzForm()
+    coordinates = table.stored_coordinates()
+    arrays: dict[str, NDArray[Any]] = {form.points: coordinates}
     for name, columns in joined_arrays(table).items():
         own = name
         while own in arrays:
@@ -162,7 +169,8 @@ def joined_arrays(table: Table) -> dict[str, NDArray[Any]]:
             continue
         array = array_of[name]
         if array not in joined:
-            of_array = [table.columns[member] for member in table.form.arrays[array]]
+            members = table.form.arrays[array]
+            of_array = [table.columns[member] for member in members]
             joined[array] = np.stack(of_array, 1)
     return joined
 

@@ -41,11 +41,13 @@ def read(path: Path) -> Table:
     """Read a PCD file; a field with a COUNT of k becomes k columns."""
     data = path.read_bytes()
     header, start = _header(data)
-    number = int(header.get("POINTS", header["WIDTH"])[0])
+    number_words = header.get("POINTS", header["WIDTH"])
+    number = int(number_words[0])
     if number < 1:
         raise BadCloudError(f"{path} holds no points.")
     layout = _layout(header)
-    array = _body(path, data[start:], header["DATA"][0], layout, number)
+    form_of_data = header["DATA"][0]
+    array = _body(path, data[start:], form_of_data, layout, number)
     columns: dict[str, Column] = {}
     grouped: dict[str, tuple[str, ...]] = {}
     for name in layout.names or ():
@@ -58,18 +60,23 @@ def read(path: Path) -> Table:
         columns |= of_field
     viewpoint = " ".join(header.get("VIEWPOINT", [NO_VIEWPOINT]))
     table = from_columns(columns, path, PcdForm(viewpoint))
-    return replace(table, form=replace(table.form, arrays=grouped))
+    form = replace(table.form, arrays=grouped)
+    return replace(table, form=form)
 
 
 def _layout(header: dict[str, list[str]]) -> np.dtype[Any]:
     """Return the data type of a point; fields without a name get one that begins with ``_``."""
     names = header["FIELDS"]
-    counts = header.get("COUNT", ["1"] * len(names))
+    ones = ["1"] * len(names)
+    counts = header.get("COUNT", ones)
     fields = []
     entries = zip(names, header["TYPE"], header["SIZE"], counts, strict=True)
-    for number, (name, kind, size, count) in enumerate(entries):
-        field = f"_{number}" if name == "_" else name
-        fields.append((field, f"<{KINDS[kind]}{int(size)}", (int(count),)))
+    for number, (name, letter, size, count) in enumerate(entries):
+        field = name
+        if name == "_":
+            field = f"_{number}"
+        kind = f"<{KINDS[letter]}{int(size)}"
+        fields.append((field, kind, (int(count),)))
     return np.dtype(fields)
 
 
@@ -83,10 +90,18 @@ def write(path: Path, table: Table) -> None:
     points = points.astype(floating(points.dtype))
     columns: dict[str, Column] = dict(zip("xyz", points.T, strict=True))
     for name, column in unique_names(table).items():
-        columns[name] = column.astype(fitting_type(name, column, TYPES, ".pcd"))
+        kind = fitting_type(name, column, TYPES, ".pcd")
+        columns[name] = column.astype(kind)
     fields = _fields(columns, table)
-    kinds = [columns[names[0]].dtype for names in fields.values()]
     letters = {kind: letter for letter, kind in KINDS.items()}
+    sizes = []
+    types = []
+    counts = []
+    for names in fields.values():
+        kind_of_field = columns[names[0]].dtype
+        sizes.append(str(kind_of_field.itemsize))
+        types.append(letters[kind_of_field.kind])
+        counts.append(str(len(names)))
     form = table.form.layout
     if not isinstance(form, PcdForm):
         form = PcdForm()
@@ -95,9 +110,9 @@ def write(path: Path, table: Table) -> None:
         "# .PCD v0.7 - Point Cloud Data file format",
         "VERSION 0.7",
         f"FIELDS {' '.join(fields)}",
-        f"SIZE {' '.join(str(kind.itemsize) for kind in kinds)}",
-        f"TYPE {' '.join(letters[kind.kind] for kind in kinds)}",
-        f"COUNT {' '.join(str(len(names)) for names in fields.values())}",
+        f"SIZE {' '.join(sizes)}",
+        f"TYPE {' '.join(types)}",
+        f"COUNT {' '.join(counts)}",
         f"WIDTH {len(rows)}",
         "HEIGHT 1",
         f"VIEWPOINT {form.viewpoint}",
@@ -118,8 +133,9 @@ def _fields(columns: dict[str, Column], table: Table) -> dict[str, list[str]]:
         field = names[start]
         length = 1
         for array, members in table.form.arrays.items():
-            are_next = tuple(names[start : start + len(members)]) == members
-            if are_next and array not in columns and _have_one_type(columns, members):
+            following = tuple(names[start : start + len(members)])
+            is_free = array not in columns
+            if following == members and is_free and _have_one_type(columns, members):
                 field = array
                 length = len(members)
         fields[field] = names[start : start + length]
@@ -180,7 +196,8 @@ def _decompressed_rows(body: bytes, layout: np.dtype[Any], number: int) -> NDArr
 
 def _ascii_rows(body: bytes, layout: np.dtype[Any], number: int) -> NDArray[Any]:
     """Return the rows of an ascii file; whole numbers of 64 bits keep all digits."""
-    words = np.array(body.split()).reshape(number, -1)
+    words = np.array(body.split())
+    words = words.reshape(number, -1)
     rows = np.zeros(number, layout)
     place = 0
     for name in layout.names or ():
@@ -192,6 +209,7 @@ def _ascii_rows(body: bytes, layout: np.dtype[Any], number: int) -> NDArray[Any]
                 text = text.astype(np.float64)
             rows[name][:, column] = text.astype(kind)
             place += 1
-    if place != words.shape[1]:
-        raise ValueError(f"its points have {words.shape[1]} numbers, not {place}")
+    width = words.shape[1]
+    if place != width:
+        raise ValueError(f"its points have {width} numbers, not {place}")
     return rows

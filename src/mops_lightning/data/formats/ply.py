@@ -97,7 +97,8 @@ def parse_mesh(data: bytes, path: Path) -> PlyMesh:
             numbers[name] = values
     corners = _corners(lists)
     if corners is None:
-        return PlyMesh(table, np.empty((0, 3), np.int64), {}, table.form.left_out)
+        no_faces = np.empty((0, 3), np.int64)
+        return PlyMesh(table, no_faces, {}, table.form.left_out)
     faces, rows = _triangles(corners)
     columns = {name: in_native_order(values)[rows] for name, values in numbers.items()}
     left_out = tuple(name for name in table.form.left_out if name != "element face")
@@ -129,11 +130,13 @@ def _triangles(polygons: Lists) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     for of_length, corners in polygons.by_length():
         whole = corners.astype(np.int64)
         for second in range(1, corners.shape[1] - 1):
-            triangles.append(whole[:, [0, second, second + 1]])
+            corners_of_triangle = [0, second, second + 1]
+            triangles.append(whole[:, corners_of_triangle])
             rows.append(of_length)
     of_face = np.concatenate(rows)
     order = of_face.argsort(kind="stable")
-    return np.concatenate(triangles)[order], of_face[order]
+    ordered = np.concatenate(triangles)[order]
+    return ordered, of_face[order]
 
 
 def _vertices(path: Path, header: Header, elements: dict[str, dict[str, Values]]) -> Table:
@@ -164,7 +167,8 @@ def _points(path: Path, header: Header) -> Element:
     """
     named = [element for element in header.elements if element.name == "vertex"]
     for element in (*named, *header.elements):
-        names = {part.name.lower() for part in element.properties if part.count is None}
+        numbers = [part for part in element.properties if part.count is None]
+        names = {part.name.lower() for part in numbers}
         if {"x", "y", "z"} <= names:
             return element
     found = ", ".join(element.name for element in header.elements) or "none"
@@ -192,14 +196,18 @@ def write_parts(path: Path, table: TableParts) -> None:
         f"element vertex {table.number}",
     ]
     for name, kind in kinds.items():
-        lines.append(f"property {TYPES[kind.str[1:]]} {name}")
+        type_name = TYPES[kind.str[1:]]
+        lines.append(f"property {type_name} {name}")
     lines.append("end_header\n")
     with path.open("wb") as file:
         file.write("\n".join(lines).encode())
         for part in table.parts:
-            columns: dict[str, Column] = dict(zip("xyz", part.points.T, strict=True))
+            coordinates = zip("xyz", part.points.T, strict=True)
+            columns: dict[str, Column] = dict(coordinates)
             columns |= unique_names(part)
-            typed = {name: column.astype(kinds[name]) for name, column in columns.items()}
+            typed = {}
+            for name, column in columns.items():
+                typed[name] = column.astype(kinds[name])
             file.write(to_rows(typed).tobytes())
 
 

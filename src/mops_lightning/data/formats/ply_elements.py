@@ -28,7 +28,11 @@ KINDS = {
 }
 """Data types by the names of a header."""
 
-BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
+BYTE_ORDERS = {
+    "binary_little_endian": "<",
+    "binary_big_endian": ">",
+    "ascii": "<",
+}
 
 LONGEST_HEADER = 1 << 20
 """Most bytes of a header; a file that exceeds it is not PLY."""
@@ -64,7 +68,8 @@ class Element:
 
     def row_type(self) -> np.dtype[Any]:
         """Return the data type of a row of an element without lists."""
-        return np.dtype([(part.name, part.kind) for part in self.properties])
+        fields = [(part.name, part.kind) for part in self.properties]
+        return np.dtype(fields)
 
 
 @dataclass(frozen=True)
@@ -99,7 +104,7 @@ class Lists:
         starts = np.cumsum(self.counts) - self.counts
         for length in np.unique(self.counts):
             rows = np.flatnonzero(self.counts == length)
-            places = starts[rows][:, None] + np.arange(length)
+            places = starts[rows, None] + np.arange(length)
             yield rows, self.items[places]
 
 
@@ -118,8 +123,11 @@ def read_header(data: bytes) -> Header:
     lines, end = _split(data)
     if not lines or lines[0] != ["ply"]:
         raise ValueError("it does not begin with ply")
-    form = lines[1] if len(lines) > 1 else []
-    if len(form) < 2 or form[0] != "format" or form[1] not in BYTE_ORDERS:
+    form = []
+    if len(lines) > 1:
+        form = lines[1]
+    is_format = len(form) >= 2 and form[0] == "format"
+    if not is_format or form[1] not in BYTE_ORDERS:
         raise ValueError("its header says no known format")
     order = BYTE_ORDERS[form[1]]
     elements: list[Element] = []
@@ -130,10 +138,13 @@ def read_header(data: bytes) -> Header:
                 raise ValueError(f"element {line[1]} has {number} rows")
             elements.append(Element(line[1], number))
         elif line[0] == "property" and elements:
-            elements[-1].properties.append(_property(line[1:], order))
+            part = _property(line[1:], order)
+            elements[-1].properties.append(part)
         else:
-            raise ValueError(f"its header has the line {' '.join(line)[:80]!r}")
-    return Header(form[1] == "ascii", elements, end)
+            text = " ".join(line)
+            raise ValueError(f"its header has the line {text[:80]!r}")
+    is_ascii = form[1] == "ascii"
+    return Header(is_ascii, elements, end)
 
 
 def _split(data: bytes) -> tuple[list[list[str]], int]:
@@ -156,14 +167,18 @@ def _split(data: bytes) -> tuple[list[list[str]], int]:
 
 
 def _property(words: list[str], order: str) -> Property:
-    if len(words) == 2 and words[0] in KINDS:
-        return Property(words[1], np.dtype(order + KINDS[words[0]]))
-    if len(words) == 4 and words[0] == "list" and words[2] in KINDS:
+    is_number = len(words) == 2 and words[0] in KINDS
+    if is_number:
+        kind = KINDS[words[0]]
+        return Property(words[1], np.dtype(order + kind))
+    is_list = len(words) == 4 and words[0] == "list" and words[2] in KINDS
+    if is_list:
         count = KINDS.get(words[1], "")
         if count.startswith(("i", "u")):
-            kind = np.dtype(order + KINDS[words[2]])
-            return Property(words[3], kind, np.dtype(order + count))
-    raise ValueError(f"its header has the property {' '.join(words)[:80]!r}")
+            kind = KINDS[words[2]]
+            return Property(words[3], np.dtype(order + kind), np.dtype(order + count))
+    text = " ".join(words)
+    raise ValueError(f"its header has the property {text[:80]!r}")
 
 
 def read_elements(data: bytes, header: Header) -> dict[str, dict[str, Values]]:
@@ -173,7 +188,8 @@ def read_elements(data: bytes, header: Header) -> dict[str, dict[str, Values]]:
         ValueError: the file ends before its last row.
     """
     if header.is_ascii:
-        return _ascii_elements(data[header.end :].split(), header.elements)
+        words = data[header.end :].split()
+        return _ascii_elements(words, header.elements)
     found = {}
     offset = header.end
     for element in header.elements:
@@ -182,7 +198,8 @@ def read_elements(data: bytes, header: Header) -> dict[str, dict[str, Values]]:
 
 
 def _ends_early(element: Element, number: int) -> ValueError:
-    return ValueError(f"its header says {element.number} rows of {element.name}, it has {number}")
+    wanted = f"{element.number} rows of {element.name}"
+    return ValueError(f"its header says {wanted}, it has {number}")
 
 
 def _binary_element(data: bytes, offset: int, element: Element) -> tuple[dict[str, Values], int]:
@@ -196,7 +213,8 @@ def _binary_element(data: bytes, offset: int, element: Element) -> tuple[dict[st
     if available < element.number:
         raise _ends_early(element, available)
     rows = np.frombuffer(data, kind, element.number, offset)
-    return {name: rows[name] for name in kind.names or ()}, offset + rows.nbytes
+    values: dict[str, Values] = {name: rows[name] for name in kind.names or ()}
+    return values, offset + rows.nbytes
 
 
 def _element_with_lists(
@@ -256,7 +274,8 @@ class _Collected:
 
     def values(self) -> Values:
         """Return the numbers of all rows, or the lists."""
-        items = np.frombuffer(b"".join(self.pieces), self.part.kind)
+        data = b"".join(self.pieces)
+        items = np.frombuffer(data, self.part.kind)
         if self.part.count is None:
             return items
         return Lists(np.array(self.counts, np.int64), items)
@@ -267,7 +286,8 @@ def _count(data: bytes, offset: int, part: Property, element: Element) -> int:
     if offset + part.count.itemsize > len(data):
         raise _ends_early(element, 0)
     count = int(np.frombuffer(data, part.count, 1, offset)[0])
-    if not 0 <= count * part.kind.itemsize <= len(data) - offset:
+    size = count * part.kind.itemsize
+    if not 0 <= size <= len(data) - offset:
         raise ValueError(f"a list of {part.name} has {count} items")
     return count
 
@@ -279,7 +299,8 @@ def _row_type_of_lengths(element: Element, lengths: Mapping[int, int]) -> np.dty
             fields.append((f"item {place}", part.kind))
         else:
             fields.append((f"count {place}", part.count))
-            fields.append((f"item {place}", part.kind, (lengths[place],)))
+            shape = (lengths[place],)
+            fields.append((f"item {place}", part.kind, shape))
     return np.dtype(fields)
 
 
@@ -311,7 +332,8 @@ def _walk(data: bytes, offset: int, element: Element) -> tuple[dict[str, Values]
                 raise _ends_early(element, row)
             column.pieces.append(data[offset:end])
             offset = end
-    return {column.part.name: column.values() for column in columns}, offset
+    values = {column.part.name: column.values() for column in columns}
+    return values, offset
 
 
 def _ascii_elements(words: list[bytes], elements: list[Element]) -> dict[str, dict[str, Values]]:
@@ -335,9 +357,10 @@ def _ascii_numbers(
     end = start + width * element.number
     if end > len(words):
         raise _ends_early(element, (len(words) - start) // width)
-    numbers = np.array(words[start:end], np.float64).reshape(-1, width)
+    numbers = np.array(words[start:end], np.float64)
+    rows = numbers.reshape(-1, width)
     values: dict[str, Values] = {}
-    for column, part in zip(numbers.T, element.properties, strict=True):
+    for column, part in zip(rows.T, element.properties, strict=True):
         values[part.name] = _of_kind(column, part)
     return values, end
 
@@ -361,11 +384,13 @@ def _ascii_lists(words: list[bytes], start: int, element: Element) -> tuple[dict
             start = end
     values: dict[str, Values] = {}
     for column, part in enumerate(element.properties):
-        numbers = _of_kind(np.array(items[column], np.float64), part)
+        exact = np.array(items[column], np.float64)
+        numbers = _of_kind(exact, part)
         if part.count is None:
             values[part.name] = numbers
         else:
-            values[part.name] = Lists(np.array(counts[column], np.int64), numbers)
+            lengths = np.array(counts[column], np.int64)
+            values[part.name] = Lists(lengths, numbers)
     return values, start
 
 

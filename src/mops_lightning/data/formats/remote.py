@@ -16,7 +16,8 @@ from mops_lightning.data.formats.isolated import isolated
 from mops_lightning.data.formats.las.header import COPC
 from mops_lightning.errors import UserError, one_line
 
-HEAD, BLOCK = 2**16, 2**20
+HEAD = 2**16
+BLOCK = 2**20
 """Bytes that are read first, and most bytes in memory."""
 
 PATIENCE = 60
@@ -40,7 +41,8 @@ def local(source: str, area: Area | None) -> Iterator[Path]:
     if not source.startswith(("http://", "https://")):
         yield Path(source)
         return
-    name = source.partition("?")[0].rpartition("/")[2]
+    address = source.partition("?")[0]
+    name = address.rpartition("/")[2]
     if not name.lower().endswith(".laz"):
         raise UserError(f"{source} must be a .copc.laz file: download others, and give their path.")
     if area is None:
@@ -52,7 +54,8 @@ def local(source: str, area: Area | None) -> Iterator[Path]:
                 _copy(source, area, path)
             yield path
         except UserError as error:
-            raise type(error)(str(error).replace(str(path), source)) from None
+            message = str(error).replace(str(path), source)
+            raise type(error)(message) from None
 
 
 def _copy(address: str, area: Area, path: Path) -> None:
@@ -73,7 +76,8 @@ def _copy(address: str, area: Area, path: Path) -> None:
         file.truncate(size)
         file.flush()
         ranges = isolated(las.ranges_of_bytes, path, area)
-        read = HEAD + size - table + sum(stop - start for start, stop in ranges)
+        wanted = sum(stop - start for start, stop in ranges)
+        read = HEAD + size - table + wanted
         print(f"reading {read / 1e6:,.1f} of {size / 1e6:,.1f} MB")
         for start, stop in ranges:
             _fetch(address, file, start, min(stop, size))
@@ -81,19 +85,22 @@ def _copy(address: str, area: Area, path: Path) -> None:
 
 def _fetch(address: str, file: BinaryIO, start: int, stop: int) -> int:
     """Copy bytes of a file to their place, and return how many bytes the file has."""
-    asked = Request(address, headers={"Range": f"bytes={start}-{stop - 1}"})
+    bytes_wanted = f"bytes={start}-{stop - 1}"
+    asked = Request(address, headers={"Range": bytes_wanted})
     try:
         with urlopen(asked, timeout=PATIENCE) as answer:
             if answer.status != 206:
                 raise UserError(f"{address}: the server sends whole files only. Download it.")
-            size = int(answer.headers["Content-Range"].rpartition("/")[2])
+            content_range = answer.headers["Content-Range"]
+            size = int(content_range.rpartition("/")[2])
             file.seek(start)
             left = min(stop, size) - start
             while block := answer.read(min(BLOCK, left)):
                 left -= file.write(block)
     except HTTPError as error:
         error.close()
-        raise UserError(f"{address}: the server answers {error.code} {error.reason}.") from None
+        reason = f"{error.code} {error.reason}"
+        raise UserError(f"{address}: the server answers {reason}.") from None
     except (OSError, HTTPException) as error:
         raise UserError(f"{address}: {one_line(error)}.") from None
     if left:

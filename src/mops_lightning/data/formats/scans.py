@@ -57,27 +57,36 @@ def read(path: Path, names: Sequence[str] | None = None) -> Table:
 
 def locate(path: Path, names: Sequence[str] | None = None) -> CloudFile:
     """Find the rows of a scan; see ``read``."""
-    chosen = tuple(names) if names is not None else assumed_columns(path)
+    if names is None:
+        chosen = assumed_columns(path)
+        given = None
+    else:
+        chosen = tuple(names)
+        given = chosen
     kind = np.dtype([(name, "<f4") for name in chosen])
     length = path.stat().st_size
     if not length or length % kind.itemsize:
+        columns = ", ".join(chosen)
+        example = ",".join(NUSCENES)
         raise BadCloudError(
             f"{path}: {length} bytes are not rows of {len(chosen)} float32 "
-            f"({', '.join(chosen)}). Name the columns of the file, such as --columns "
-            f"{','.join(NUSCENES)}."
+            f"({columns}). Name the columns of the file, such as --columns "
+            f"{example}."
         )
     number = length // kind.itemsize
     if names is None:
         _check_values(path, chosen)
     parse_numbers = binary_file(path, number, kind).parse
-    given = chosen if names is not None else None
     labels = _label_file(path)
-    if labels is not None and labels.stat().st_size != 4 * number:
-        raise BadCloudError(
-            f"{labels} has {labels.stat().st_size} bytes, not 4 for each of the {number} points of "
-            f"{path}."
-        )
-    return CloudFile(path, number, partial(_parse, parse_numbers, labels, ScanForm(given)))
+    if labels is not None:
+        bytes_of_labels = labels.stat().st_size
+        if bytes_of_labels != 4 * number:
+            raise BadCloudError(
+                f"{labels} has {bytes_of_labels} bytes, not 4 for each of the {number} points of "
+                f"{path}."
+            )
+    parse = partial(_parse, parse_numbers, labels, ScanForm(given))
+    return CloudFile(path, number, parse)
 
 
 def _parse(
@@ -96,12 +105,15 @@ def _parse(
         "label": (packed & 0xFFFF).astype(np.uint16),
         "instance": (packed >> 16).astype(np.uint16),
     }
-    return replace(table, columns={**table.columns, **classes}, form=form)
+    columns = {**table.columns, **classes}
+    return replace(table, columns=columns, form=form)
 
 
 def assumed_columns(path: Path) -> tuple[str, ...]:
     """Return the columns of a file by its name."""
-    return NUSCENES if path.name.lower().endswith(NUSCENES_SUFFIX) else KITTI
+    if path.name.lower().endswith(NUSCENES_SUFFIX):
+        return NUSCENES
+    return KITTI
 
 
 def _label_file(path: Path) -> Path | None:
@@ -116,20 +128,25 @@ def _label_file(path: Path) -> Path | None:
 def _check_values(path: Path, names: tuple[str, ...]) -> None:
     """Reject a file whose numbers do not look like the columns that it should have."""
     width = len(names)
-    numbers = np.fromfile(path, "<f4", LOOKED_AT // width * width)
+    whole_rows = LOOKED_AT // width
+    numbers = np.fromfile(path, "<f4", whole_rows * width)
     rows = numbers.reshape(-1, width)
     with np.errstate(invalid="ignore"):
-        negative = bool((rows[:, names.index("intensity")] < 0).any())
-    if negative or _fits_others_better(numbers, width):
+        intensity = rows[:, names.index("intensity")]
+        has_negative = bool((intensity < 0).any())
+    if has_negative or _fits_others_better(numbers, width):
+        columns = ", ".join(names)
+        example = ",".join(NUSCENES)
         raise BadCloudError(
-            f"{path} does not look like rows of {', '.join(names)}. Name its columns, such as "
-            f"--columns {','.join(NUSCENES)}; if these are right: --columns {','.join(names)}."
+            f"{path} does not look like rows of {columns}. Name its columns, such as "
+            f"--columns {example}; if these are right: --columns {','.join(names)}."
         )
 
 
 def _fits_others_better(numbers: NDArray[np.float32], width: int) -> bool:
     """Return whether points with another number of columns would differ much less."""
-    values = np.arcsinh(numbers[np.isfinite(numbers)].astype(np.float64))
+    finite = numbers[np.isfinite(numbers)]
+    values = np.arcsinh(finite.astype(np.float64))
     if len(values) < FEW_POINTS * width:
         return False
     assumed = _mean_difference(values, width)
@@ -139,7 +156,8 @@ def _fits_others_better(numbers: NDArray[np.float32], width: int) -> bool:
 
 def _mean_difference(values: NDArray[np.float64], width: int) -> float:
     """Return the mean difference of numbers that would be one column of neighbouring points."""
-    return float(np.abs(values[width:] - values[:-width]).mean())
+    differences = values[width:] - values[:-width]
+    return float(np.abs(differences).mean())
 
 
 def write(path: Path, table: Table, names: tuple[str, ...] = KITTI) -> list[str]:
@@ -161,10 +179,8 @@ def write(path: Path, table: Table, names: tuple[str, ...] = KITTI) -> list[str]
     chosen = names
     if isinstance(layout, ScanForm) and layout.names is not None:
         chosen = layout.names
-    available: dict[str, Column] = {
-        **dict(zip("xyz", table.points.T, strict=True)),
-        **table.columns,
-    }
+    coordinates = zip("xyz", table.points.T, strict=True)
+    available: dict[str, Column] = {**dict(coordinates), **table.columns}
     rows = np.zeros((len(table.points), len(chosen)), "<f4")
     notes = []
     for place, name in enumerate(chosen):
@@ -177,7 +193,8 @@ def write(path: Path, table: Table, names: tuple[str, ...] = KITTI) -> list[str]
             notes.append(f"{changed:,} numbers of {name} are rounded to float32")
     left_out = [name for name in table.columns if name not in chosen]
     if left_out:
-        notes.append(f"no room for {', '.join(left_out)}: .bin holds {', '.join(chosen)}")
+        lost = ", ".join(left_out)
+        notes.append(f"no room for {lost}: .bin holds {', '.join(chosen)}")
     rows.tofile(path)
     return notes
 
@@ -187,8 +204,10 @@ def _check_digits(points: NDArray[np.float64]) -> None:
     if not len(finite):
         return
     with np.errstate(over="ignore"):
-        moved = np.abs(finite.astype(np.float32) - finite).max()
-    if moved > TOLERANCE * np.ptp(finite, axis=0).max():
+        rounded = finite.astype(np.float32)
+        moved = np.abs(rounded - finite).max()
+    extent = np.ptp(finite, axis=0).max()
+    if moved > TOLERANCE * extent:
         raise CannotHoldError(
             ".bin holds float32, which would move these points, far from the origin, by "
             f"up to {moved:.3g}. Write .ply, .npy or .las."

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mops_lightning.data.formats.columns import common_names
 from mops_lightning.data.formats.table import Column
 
 Mesh = Any
@@ -63,8 +64,8 @@ def _vertex_attributes(part: Mesh, transform: NDArray[np.float64]) -> dict[str, 
     columns: dict[str, Column] = {}
     if "vertex_normals" in part._cache.cache:  # otherwise trimesh would compute them
         # Under an uneven scale, normals turn the other way than the surface.
-        inverse = np.linalg.inv(transform[:3, :3])
-        normals = np.asarray(part.vertex_normals) @ inverse
+        linear = transform[:3, :3]
+        normals = np.asarray(part.vertex_normals) @ np.linalg.inv(linear)
         columns |= dict(zip(NORMALS, normals.T, strict=True))
     if _has_colours(part, "vertex"):
         columns |= _colours(part.visual.vertex_colors)
@@ -76,15 +77,18 @@ def _has_colours(part: Mesh, kind: str) -> bool:
 
 
 def _colours(values: Any) -> dict[str, Column]:
-    return dict(zip(COLOURS, np.asarray(values).T, strict=True))
+    channels = np.asarray(values).T
+    return dict(zip(COLOURS, channels, strict=True))
 
 
 def _joined(parts: list[dict[str, Column]]) -> dict[str, Column]:
     """Return the columns that all parts have."""
     if not parts:
         return {}
-    names = [name for name in parts[0] if all(name in part for part in parts)]
-    return {name: np.concatenate([part[name] for part in parts]) for name in names}
+    joined = {}
+    for name in common_names(parts):
+        joined[name] = np.concatenate([part[name] for part in parts])
+    return joined
 
 
 def attributes(
@@ -107,14 +111,16 @@ def attributes(
     from trimesh.triangles import points_to_barycentric
 
     triangles = np.asarray(mesh.triangles)[faces]
-    weights = np.nan_to_num(points_to_barycentric(triangles, points)).clip(0, 1)
+    barycentric = points_to_barycentric(triangles, points)
+    weights = np.nan_to_num(barycentric).clip(0, 1)
     corners = np.asarray(mesh.faces)[faces]
     columns = {name: column[faces] for name, column in mesh.face_attributes.items()}
     for name, column in mesh.vertex_attributes.items():
         columns[name] = _at_points(name, column[corners], weights)
     if all(name in mesh.vertex_attributes for name in NORMALS):
         return columns | _unit_normals(columns)
-    of_face = np.asarray(mesh.face_normals)[faces].astype(np.float32)
+    face_normals = np.asarray(mesh.face_normals)
+    of_face = face_normals[faces].astype(np.float32)
     return columns | dict(zip(NORMALS, of_face.T, strict=True))
 
 
@@ -123,15 +129,18 @@ def _at_points(name: str, values: Column, weights: NDArray[np.float64]) -> Colum
     is_float = values.dtype.kind == "f"
     if not is_float and name not in COLOURS:
         nearest = weights.argmax(1)
-        return values[np.arange(len(values)), nearest]
-    mean = (values * weights).sum(1) / weights.sum(1)
+        rows = np.arange(len(values))
+        return values[rows, nearest]
+    total = (values * weights).sum(1)
+    mean = total / weights.sum(1)
     if not is_float:
         mean = mean.round()
     return mean.astype(values.dtype)
 
 
 def _unit_normals(columns: dict[str, Column]) -> dict[str, Column]:
-    normals = np.stack([columns[name] for name in NORMALS], 1).astype(np.float64)
+    axes = [columns[name] for name in NORMALS]
+    normals = np.stack(axes, 1).astype(np.float64)
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     lengths[lengths == 0] = 1
     unit = (normals / lengths).astype(np.float32)

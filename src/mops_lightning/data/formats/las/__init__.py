@@ -43,7 +43,8 @@ def locate(path: Path) -> CloudFile:
     _check_installed(path)
     header = read_header(path)
     layout_of(header)  # reports its mistakes now
-    return CloudFile(path, header.number, partial(_parse_rows, _small(header)), header)
+    parse = partial(_parse_rows, _small(header))
+    return CloudFile(path, header.number, parse, header)
 
 
 def locate_area(file: CloudFile, area: Area) -> CloudFile:
@@ -60,11 +61,13 @@ def locate_area(file: CloudFile, area: Area) -> CloudFile:
         return replace(file, area=area)
     cells = isolated(copc.cells, file.path, header, area)
     if not cells:
-        corners = ",".join(f"{number:.10g}" for corner in header.bounds for number in corner)
+        numbers = [f"{number:.10g}" for corner in header.bounds for number in corner]
+        corners = ",".join(numbers)
         raise BadCloudError(f"--bounds: all points of {file.path} are in {corners}.")
     number = sum(cell.number for cell in cells)
     parse = partial(_parse_cells, _small(header), area)
-    return CloudFile(file.path, number, parse, header, replace(area, level=None, resolution=None))
+    bounds = replace(area, level=None, resolution=None)
+    return CloudFile(file.path, number, parse, header, bounds)
 
 
 def ranges_of_bytes(path: Path, area: Area) -> list[tuple[int, int]]:
@@ -108,14 +111,18 @@ def _parse_rows(header: Header, path: Path, rows: range) -> tables.Table:
     if header.compressed:
         packed = isolated(chunks.read_rows, path, header, rows)
         return _table(path, header, packed)
-    start = header.first + rows.start * header.item
-    packed = np.fromfile(path, np.uint8, len(rows) * header.item, offset=start)
-    return _table(path, header, packed[: len(packed) // header.item * header.item])
+    size = header.item
+    start = header.first + rows.start * size
+    packed = np.fromfile(path, np.uint8, len(rows) * size, offset=start)
+    whole_rows = len(packed) // size
+    return _table(path, header, packed[: whole_rows * size])
 
 
 def _parse_cells(header: Header, area: Area, path: Path, rows: range) -> tables.Table:
     """Read a range of the rows of the cells that overlap an area."""
-    return _table(path, header, isolated(partial(copc.read_cells, area), path, header, rows))
+    read_cells = partial(copc.read_cells, area)
+    packed = isolated(read_cells, path, header, rows)
+    return _table(path, header, packed)
 
 
 def _table(path: Path, header: Header, packed: chunks.Bytes) -> tables.Table:
@@ -134,12 +141,14 @@ def _check_plausible(path: Path, header: Header, rows: Rows) -> None:
     if not len(rows):
         return
     low, high = (np.array(bound) for bound in header.bounds)
+    room = (high - low).max()
     for place, axis in enumerate("XYZ"):
-        least, most = int(rows[axis].min()), int(rows[axis].max())
+        least = int(rows[axis].min())
+        most = int(rows[axis].max())
         ends = np.array([least, most]) * header.scales[place] + header.offsets[place]
-        room = (high - low).max()
-        outside = ends[0] < low[place] - room or ends[1] > high[place] + room
-        if outside and most - least > DAMAGED:
+        is_below = ends[0] < low[place] - room
+        is_above = ends[1] > high[place] + room
+        if (is_below or is_above) and most - least > DAMAGED:
             raise BadCloudError(
                 f"{path} is broken: it has points far outside of its header's bounds."
             )

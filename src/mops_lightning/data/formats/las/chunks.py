@@ -38,8 +38,11 @@ def read_rows(path: Path, header: Header, rows: range) -> Bytes:
     with path.open("rb") as file:
         chunks = _chunks(file, header)
         ends = list(accumulate(chunk.number for chunk in chunks))
-        low, high = np.searchsorted(ends, [rows.start, rows.stop - 1], side="right")
-        before = ends[low - 1] if low else 0
+        first_and_last = [rows.start, rows.stop - 1]
+        low, high = np.searchsorted(ends, first_and_last, side="right")
+        before = 0
+        if low:
+            before = ends[low - 1]
         wanted = range(rows.start - before, rows.stop - before)
         return decompress(file, header, chunks[low : high + 1], wanted)
 
@@ -54,12 +57,15 @@ def decompress(file: Any, header: Header, chunks: list[Chunk], rows: range) -> B
         rows: counted from the first point of the first chunk.
     """
     number = sum(chunk.number for chunk in chunks)
-    rows = range(rows.start, max(min(rows.stop, number), rows.start))
+    stop = min(rows.stop, number)
+    rows = range(rows.start, max(stop, rows.start))
     points = np.empty(len(rows) * header.item, np.uint8)
-    done, first = 0, 0
+    done = 0
+    first = 0
     for group in _groups(chunks):
         number = sum(chunk.number for chunk in group)
-        low, high = max(rows.start - first, 0), min(rows.stop - first, number)
+        low = max(rows.start - first, 0)
+        high = min(rows.stop - first, number)
         if low < high:
             part = _decompress_group(file, header, group, range(low, high))
             points[done : done + len(part)] = part
@@ -75,7 +81,8 @@ def _groups(chunks: list[Chunk]) -> Iterator[list[Chunk]]:
     for chunk in chunks:
         if group and chunk.number > room:
             yield group
-            group, room = [], LARGEST
+            group = []
+            room = LARGEST
         group.append(chunk)
         room -= chunk.number
     if group:
@@ -85,7 +92,8 @@ def _groups(chunks: list[Chunk]) -> Iterator[list[Chunk]]:
 def _decompress_group(file: Any, header: Header, chunks: list[Chunk], rows: range) -> Bytes:
     import lazrs
 
-    item, record = header.item, header.compression
+    item = header.item
+    record = header.compression
     data = b"".join(_read(file, chunk) for chunk in chunks)
     table = [(chunk.number, chunk.size) for chunk in chunks]
     number = sum(chunk.number for chunk in chunks)
@@ -94,7 +102,8 @@ def _decompress_group(file: Any, header: Header, chunks: list[Chunk], rows: rang
         lazrs.decompress_points_with_chunk_table(data, record, points, table)
         return points[rows.start * item : rows.stop * item]
     stream = BytesIO()  # a LAZ file of one chunk
-    stream.write(struct.pack("<q", 8 + len(data)) + data)
+    place_of_table = struct.pack("<q", 8 + len(data))
+    stream.write(place_of_table + data)
     lazrs.write_chunk_table(stream, table, lazrs.LazVlr(record))
     stream.seek(0)
     decompressor = lazrs.LasZipDecompressor(stream, record)
@@ -121,12 +130,14 @@ def _chunks(file: Any, header: Header) -> list[Chunk]:
     _check_table(file, header)
     file.seek(header.first)
     table = lazrs.read_chunk_table(file, lazrs.LazVlr(header.compression))
-    left, start = header.number, header.first + 8  # after the place of the table
+    left = header.number
+    start = header.first + 8  # after the place of the table
     chunks = []
     for number, size in table:
-        chunks.append(Chunk(start, size, min(number, left)))
+        chunk = Chunk(start, size, min(number, left))
+        chunks.append(chunk)
         start += size
-        left -= chunks[-1].number
+        left -= chunk.number
     return chunks
 
 

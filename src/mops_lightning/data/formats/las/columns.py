@@ -23,7 +23,10 @@ class LasColumns(PackedColumns):
     """
 
     def __init__(
-        self, rows: Rows, layout: Layout, changes: Mapping[str, Column] | None = None
+        self,
+        rows: Rows,
+        layout: Layout,
+        changes: Mapping[str, Column] | None = None,
     ) -> None:
         self.rows = rows
         self.layout = layout
@@ -35,7 +38,8 @@ class LasColumns(PackedColumns):
         return self.layout.dimensions[name].get(self.rows)
 
     def __iter__(self) -> Iterator[str]:
-        return iter(dict.fromkeys([*self.layout.dimensions, *self.changes]))
+        names = [*self.layout.dimensions, *self.changes]
+        return iter(dict.fromkeys(names))
 
     def __len__(self) -> int:
         return len(list(iter(self)))
@@ -47,18 +51,24 @@ class LasColumns(PackedColumns):
 
     def replaced(self, columns: Mapping[str, Column]) -> "LasColumns":
         """Return the columns with others in their place, or beside them."""
-        return LasColumns(self.rows, self.layout, {**self.changes, **columns})
+        changes = {**self.changes, **columns}
+        return LasColumns(self.rows, self.layout, changes)
 
     def joined(self, others: "Sequence[Any]") -> "LasColumns":
         """Return these columns followed by those of other points of the same file."""
         parts = [self, *others]
-        names = self.changes
-        changes = {name: np.concatenate([part.changes[name] for part in parts]) for name in names}
-        return LasColumns(np.concatenate([part.rows for part in parts]), self.layout, changes)
+        changes = {}
+        for name in self.changes:
+            changes[name] = np.concatenate([part.changes[name] for part in parts])
+        rows = np.concatenate([part.rows for part in parts])
+        return LasColumns(rows, self.layout, changes)
 
 
 def table_of(header: Header, layout: Layout, rows: Rows) -> Table:
     """Make a table of packed points; coordinates are scaled and shifted."""
-    axes = zip("XYZ", header.scales, header.offsets, strict=True)
-    points = np.stack([rows[axis] * scale + offset for axis, scale, offset in axes], 1)
-    return Table(points, LasColumns(rows, layout), form=Form(arrays=layout.arrays))
+    coordinates = []
+    for axis, scale, offset in zip("XYZ", header.scales, header.offsets, strict=True):
+        coordinates.append(rows[axis] * scale + offset)
+    points = np.stack(coordinates, 1)
+    form = Form(arrays=layout.arrays)
+    return Table(points, LasColumns(rows, layout), form=form)

@@ -58,21 +58,27 @@ class Octree:
         """Return whether a cell is in an area."""
         size = self.side / 2**key.level
         corner = np.array(self.low) + np.array(key[1:]) * size
-        inside: np.bool_ = ((corner <= area.high) & (corner + size >= area.low)).all()
-        return bool(inside)
+        starts_before_end = corner <= area.high
+        ends_after_start = corner + size >= area.low
+        overlaps = starts_before_end & ends_after_start
+        return bool(overlaps.all())
 
     def levels(self, area: Area) -> float:
         """Return the deepest level of an area."""
         if area.resolution is not None:
-            return max(0, ceil(log2(self.spacing) - log2(area.resolution)))
-        return np.inf if area.level is None else area.level
+            halvings = log2(self.spacing) - log2(area.resolution)
+            return max(0, ceil(halvings))
+        if area.level is None:
+            return np.inf
+        return area.level
 
 
 def octree_of(header: Header) -> Octree:
     """Return the octree that a COPC file's header describes."""
     assert header.copc is not None
     x, y, z, half, spacing, place, size, *_ = INFO.unpack_from(header.copc.data)
-    return Octree((x - half, y - half, z - half), 2 * half, spacing, (place, size))
+    low = (x - half, y - half, z - half)
+    return Octree(low, side=2 * half, spacing=spacing, page=(place, size))
 
 
 def cells(path: Path, header: Header, area: Area) -> list[Chunk]:
@@ -81,7 +87,8 @@ def cells(path: Path, header: Header, area: Area) -> list[Chunk]:
     deepest = octree.levels(area)
     found = []
     with path.open("rb") as file:
-        for key, chunk in _entries(file, path.stat().st_size, octree, area, deepest):
+        size = path.stat().st_size
+        for key, chunk in _entries(file, size, octree, area, deepest):
             if key.level <= deepest and octree.overlaps(key, area):
                 found.append(chunk)
     return sorted(found)
@@ -91,15 +98,16 @@ def _entries(
     file: Any, size: int, octree: Octree, area: Area, deepest: float
 ) -> Iterator[tuple[Key, Chunk]]:
     """Yield the entries with points of all pages with cells of an area."""
-    pages, seen = [octree.page], {octree.page[0]}
+    pages = [octree.page]
+    seen = {octree.page[0]}
     while pages:
         place, length = pages.pop()
         if length < ENTRY.size or place + length > size:
             raise ValueError("it ends before its octree")
         file.seek(place)
-        for *numbers, start, bytes_, number in ENTRY.iter_unpack(
-            file.read(length // ENTRY.size * ENTRY.size)
-        ):
+        whole_entries = length // ENTRY.size
+        data = file.read(whole_entries * ENTRY.size)
+        for *numbers, start, bytes_, number in ENTRY.iter_unpack(data):
             key = Key(*numbers)
             if number == PAGE:
                 is_new = start not in seen
@@ -114,11 +122,13 @@ def _entries(
 
 def read_cells(area: Area, path: Path, header: Header, rows: range) -> Bytes:
     """Return the bytes of a range of the points of the cells that overlap an area."""
-    found, first = cells(path, header, area), 0
+    found = cells(path, header, area)
+    first = 0
     while found and first + found[0].number <= rows.start:
         first += found.pop(0).number
     with path.open("rb") as file:
-        return decompress(file, header, found, range(rows.start - first, rows.stop - first))
+        wanted = range(rows.start - first, rows.stop - first)
+        return decompress(file, header, found, wanted)
 
 
 def ranges_of_bytes(path: Path, header: Header, area: Area) -> list[tuple[int, int]]:
@@ -128,8 +138,12 @@ def ranges_of_bytes(path: Path, header: Header, area: Area) -> list[tuple[int, i
     """
     joined: list[tuple[int, int]] = []
     for cell in cells(path, header, area):
-        start, stop = cell.start, cell.start + cell.size
-        if joined and start - joined[-1][1] < GAP:
-            start = joined.pop()[0]
+        start = cell.start
+        stop = cell.start + cell.size
+        if joined:
+            last_start, last_stop = joined[-1]
+            if start - last_stop < GAP:
+                joined.pop()
+                start = last_start
         joined.append((start, stop))
     return joined

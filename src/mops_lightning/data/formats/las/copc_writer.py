@@ -37,11 +37,13 @@ class Cells:
     def add(self, key: Key, rows: Rows) -> None:
         """Write a cell, or keep it to write it with others."""
         if not len(rows):
-            self.entries.append(ENTRY.pack(*key, 0, 0, 0))
+            entry = ENTRY.pack(*key, 0, 0, 0)
+            self.entries.append(entry)
             return
         self.summary.add(rows)
         self.waiting.append((key, rows))
-        if sum(len(rows) for _, rows in self.waiting) >= TOGETHER:
+        number = sum(len(rows) for _, rows in self.waiting)
+        if number >= TOGETHER:
             self._write_waiting()
 
     def _write_waiting(self) -> None:
@@ -50,16 +52,19 @@ class Cells:
         buffer = BytesIO()
         layout = lazrs.LazVlr(self.record.data)
         compressor = lazrs.ParLasZipCompressor(buffer, layout)
-        compressor.compress_chunks([rows.tobytes() for _, rows in self.waiting])
+        chunks = [rows.tobytes() for _, rows in self.waiting]
+        compressor.compress_chunks(chunks)
         compressor.done()
         buffer.seek(0)
         table = lazrs.read_chunk_table(buffer, layout)
         start = self.stream.tell()
         for (key, _), (number, size) in zip(self.waiting, table, strict=True):
-            self.entries.append(ENTRY.pack(*key, start, size, number))
+            entry = ENTRY.pack(*key, start, size, number)
+            self.entries.append(entry)
             start += size
-        size = sum(size for _, size in table)
-        self.stream.write(buffer.getbuffer()[8 : 8 + size])
+        total = sum(size for _, size in table)
+        compressed = buffer.getbuffer()[8 : 8 + total]
+        self.stream.write(compressed)
         self.chunks += table
         self.waiting.clear()
 
@@ -71,7 +76,8 @@ class Cells:
             self._write_waiting()
         place = self.stream.tell()
         table = BytesIO()
-        lazrs.write_chunk_table(table, self.chunks, lazrs.LazVlr(self.record.data))
+        layout = lazrs.LazVlr(self.record.data)
+        lazrs.write_chunk_table(table, self.chunks, layout)
         self.stream.write(table.getvalue())
         self.stream.seek(self.first)
         self.stream.write(struct.pack("<q", place))
@@ -88,8 +94,10 @@ def write_copc_parts(path: Path, table: TableParts) -> list[str]:
     low, side = _cube(header, table)
 
     def with_info(place: int, size: int, times: tuple[float, float]) -> Header:
-        info = INFO.pack(*low + side / 2, side / 2, side / GRID, place, size, *times)
-        records = (Record.new(COPC, 1, info, "COPC info VLR"), *header.records, record)
+        half = side / 2
+        info = INFO.pack(*low + half, half, side / GRID, place, size, *times)
+        first = Record.new(COPC, 1, info, "COPC info VLR")
+        records = (first, *header.records, record)
         return replace(header, records=records)
 
     with path.open("wb+") as stream:
@@ -97,13 +105,14 @@ def write_copc_parts(path: Path, table: TableParts) -> list[str]:
         summary = Summary(preliminary, form.layout)
         begin(stream, preliminary, compressed=True)
         cells = Cells(stream, record, summary)
-        scales, offsets = header.scales, header.offsets
-        builder = Builder(low, side, scales, offsets, cells.add, path.parent)
-        builder.build((form.pack(part) for part in parts), table.number)
+        builder = Builder(low, side, header.scales, header.offsets, cells.add, path.parent)
+        packed = (form.pack(part) for part in parts)
+        builder.build(packed, table.number)
         cells.close()
         page = b"".join(cells.entries)
         place = stream.seek(0, 2) + EXTENDED_RECORD.size
-        extended = [Record.new(COPC, HIERARCHY, page, "EPT hierarchy"), *header.extended]
+        hierarchy = Record.new(COPC, HIERARCHY, page, "EPT hierarchy")
+        extended = [hierarchy, *header.extended]
         final = with_info(place, len(page), summary.times)
         finish(stream, final, True, summary, extended)
     return form.notes()
@@ -115,6 +124,9 @@ def _cube(header: Header, table: TableParts) -> tuple[NDArray[np.float64], float
     Its lowest corner is that of the header's bounds: some readers, such as copclib 2.6, take that
     for the corner of the octree.
     """
-    scales, offsets = np.array(header.scales), np.array(header.offsets)
-    low, high = np.rint((table.corners - offsets) / scales) * scales + offsets
-    return low, max(float((high - low).max()), float(scales.max()))
+    scales = np.array(header.scales)
+    offsets = np.array(header.offsets)
+    whole = np.rint((table.corners - offsets) / scales)
+    low, high = whole * scales + offsets
+    longest = float((high - low).max())
+    return low, max(longest, float(scales.max()))

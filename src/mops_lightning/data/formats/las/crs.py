@@ -10,7 +10,8 @@ from mops_lightning.data.formats.las.header import Header, Record
 PROJECTION = "LASF_Projection"
 """The user of the records of the coordinate system."""
 
-WKT_RECORD, GEOTIFF_KEYS = 2112, 34735
+WKT_RECORD = 2112
+GEOTIFF_KEYS = 34735
 GEOTIFF_RECORDS = (GEOTIFF_KEYS, 34736, 34737)
 """Numbers of these records."""
 
@@ -26,15 +27,21 @@ def with_wkt(header: Header) -> Header:
     """
     head = bytearray(header.head)
     struct.pack_into("<H", head, 6, header.encoding | WKT)
-    projection = [r for r in (*header.records, *header.extended) if r.user == PROJECTION]
+    records = (*header.records, *header.extended)
+    projection = [record for record in records if record.user == PROJECTION]
     numbers = {record.number for record in projection}
     if WKT_RECORD in numbers or GEOTIFF_KEYS not in numbers:
         return replace(header, head=bytes(head))
     keys = next(record for record in projection if record.number == GEOTIFF_KEYS)
-    wkt = _converted(keys).to_wkt("WKT1_GDAL", pretty=False).encode() + b"\0"
-    others = [r for r in header.records if r.user != PROJECTION or r.number not in GEOTIFF_RECORDS]
-    records = (*others, Record.new(PROJECTION, WKT_RECORD, wkt, "OGC WKT"))
-    return replace(header, head=bytes(head), records=records)
+    system = _converted(keys)
+    wkt = system.to_wkt("WKT1_GDAL", pretty=False).encode() + b"\0"
+    others = [record for record in header.records if not _is_geotiff(record)]
+    wkt_record = Record.new(PROJECTION, WKT_RECORD, wkt, "OGC WKT")
+    return replace(header, head=bytes(head), records=(*others, wkt_record))
+
+
+def _is_geotiff(record: Record) -> bool:
+    return record.user == PROJECTION and record.number in GEOTIFF_RECORDS
 
 
 def _converted(keys: Record) -> Any:

@@ -77,9 +77,12 @@ class Builder:
         emit: Emit,
         folder: Path,
     ) -> None:
-        self.low, self.side = low, side
-        self.scales, self.offsets = scales, offsets
-        self.emit, self.folder = emit, folder
+        self.low = low
+        self.side = side
+        self.scales = scales
+        self.offsets = offsets
+        self.emit = emit
+        self.folder = folder
 
     def build(self, parts: Iterable[Rows], number: int) -> None:
         """Sort points into cells.
@@ -89,7 +92,8 @@ class Builder:
             number: how many points all parts have.
         """
         root = Key(0, 0, 0, 0)
-        self.emit(root, self._sample(root, parts, number)[0])
+        rows, _ = self._sample(root, parts, number)
+        self.emit(root, rows)
 
     def _sample(self, key: Key, parts: Iterable[Rows], number: int) -> tuple[Rows, bool]:
         """Build what is below a cell; return the cell's points and whether cells are below it."""
@@ -97,13 +101,15 @@ class Builder:
             return np.concatenate(list(parts)), False
         samples = []
         for child, below, count in self._split(key, parts, number):
-            samples.append((child, *self._sample(child, below, count)))
+            sample, has_cells = self._sample(child, below, count)
+            samples.append((child, sample, has_cells))
         rows = np.concatenate([sample for _, sample, _ in samples])
         chosen = np.zeros(len(rows), bool)
         chosen[self._thin(key, rows)] = True
         start = 0
         for child, sample, has_cells in samples:
-            left = sample[~chosen[start : start + len(sample)]]
+            is_chosen = chosen[start : start + len(sample)]
+            left = sample[~is_chosen]
             start += len(sample)
             if len(left) or has_cells:
                 self.emit(child, left)
@@ -135,36 +141,48 @@ class Builder:
         """Return which of the eight cells below a cell every point is in."""
         octants = np.zeros(len(rows), np.int64)
         for place in range(3):
-            along = self._along(rows, place) / self.side * 2 ** (key.level + 1)
-            half = np.clip(np.floor(along) - 2 * key[1 + place], 0, 1)
+            cells_of_octants = 2 ** (key.level + 1)
+            along = self._along(rows, place) / self.side * cells_of_octants
+            start = 2 * key[1 + place]
+            half = np.clip(np.floor(along) - start, 0, 1)
             octants |= half.astype(np.int64) << place
         return octants
 
     def _along(self, rows: Rows, place: int) -> NDArray[np.float64]:
         """Return the distances from the low side of the cube."""
-        coordinates = rows["XYZ"[place]] * self.scales[place] + self.offsets[place]
+        whole = rows["XYZ"[place]]
+        coordinates = whole * self.scales[place] + self.offsets[place]
         distances: NDArray[np.float64] = coordinates - self.low[place]
         return distances
 
     def _thin(self, key: Key, rows: Rows) -> NDArray[np.int64]:
         """Return the rows that are the sample of a cell."""
         size = self.side / 2**key.level
-        along = np.stack([self._along(rows, place) for place in range(3)], 1) / size - key[1:]
+        distances_of_axes = [self._along(rows, place) for place in range(3)]
+        along = np.stack(distances_of_axes, 1) / size - key[1:]
         grid = GRID
         while True:
-            cubes = np.clip(np.floor(along * grid), 0, grid - 1).astype(np.int64)
-            numbers = (cubes[:, 0] * grid + cubes[:, 1]) * grid + cubes[:, 2]
+            cells = np.floor(along * grid)
+            cubes = np.clip(cells, 0, grid - 1).astype(np.int64)
+            x, y, z = cubes.T
+            numbers = (x * grid + y) * grid + z
             if grid == 1 or len(np.unique(numbers)) <= LEAF:
                 break
             grid //= 2
-        distances = ((along * grid - cubes - 0.5) ** 2).sum(1)
+        from_centre = along * grid - cubes - 0.5
+        distances = (from_centre**2).sum(1)
         order = np.lexsort((distances, numbers))
         first = np.ones(len(order), bool)
-        first[1:] = numbers[order][1:] != numbers[order][:-1]
+        ordered = numbers[order]
+        first[1:] = ordered[1:] != ordered[:-1]
         return order[first]
 
 
 def _child(key: Key, octant: int) -> Key:
     """Return a cell below a cell; bits 0 to 2 of ``octant`` say which half in x, y and z."""
-    x, y, z = (2 * key[1 + place] + (octant >> place & 1) for place in range(3))
+    places = []
+    for axis in range(3):
+        bit = octant >> axis & 1
+        places.append(2 * key[1 + axis] + bit)
+    x, y, z = places
     return Key(key.level + 1, x, y, z)

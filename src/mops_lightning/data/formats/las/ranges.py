@@ -60,8 +60,10 @@ class Entry:
             self.smallest = smallest
             self.largest = largest
             return
-        self.smallest = [min(pair) for pair in zip(self.smallest, smallest, strict=True)]
-        self.largest = [max(pair) for pair in zip(self.largest, largest, strict=True)]
+        lows = zip(self.smallest, smallest, strict=True)
+        highs = zip(self.largest, largest, strict=True)
+        self.smallest = [min(pair) for pair in lows]
+        self.largest = [max(pair) for pair in highs]
 
     def _values(self, numbers: NDArray[Any], element: int) -> NDArray[Any]:
         """Return the numbers that are values."""
@@ -81,7 +83,8 @@ class Entry:
             self._write(entry, PLACES[LARGEST], self.largest)
 
     def _write(self, entry: bytearray, start: int, values: list[Any]) -> None:
-        struct.pack_into(f"<{self.count}{WIDE[self.kind]}", entry, start, *values)
+        form = f"<{self.count}{WIDE[self.kind]}"
+        struct.pack_into(form, entry, start, *values)
 
 
 class ExtraRanges:
@@ -111,12 +114,13 @@ class ExtraRanges:
         """Return the records of the file with the numbers of its points."""
         filled = list(records)
         for (number, start), entry in self.entries.items():
-            data = bytearray(filled[number].data)
+            record = filled[number]
+            data = bytearray(record.data)
             end = start + EXTRA.size
             text = data[start:end]
             entry.fill(text)
             data[start:end] = text
-            filled[number] = replace(filled[number], data=bytes(data))
+            filled[number] = replace(record, data=bytes(data))
         return tuple(filled)
 
 
@@ -127,7 +131,8 @@ def _entries(records: tuple[Record, ...]) -> Iterator[tuple[int, int, bytes]]:
             continue
         last = len(record.data) - EXTRA.size
         for start in range(0, last + 1, EXTRA.size):
-            yield number, start, record.data[start : start + EXTRA.size]
+            data = record.data[start : start + EXTRA.size]
+            yield number, start, data
 
 
 def _entry(number: int, layout: Layout, data: bytes) -> Entry:
@@ -136,5 +141,6 @@ def _entry(number: int, layout: Layout, data: bytes) -> Entry:
     options = data[3]
     no_data = None
     if options & NO_DATA:
-        no_data = struct.unpack_from(f"<{extra.count}{WIDE[kind]}", data, PLACES[NO_DATA])
+        form = f"<{extra.count}{WIDE[kind]}"
+        no_data = struct.unpack_from(form, data, PLACES[NO_DATA])
     return Entry(f"extra {number}", kind, extra.count, options, no_data)
