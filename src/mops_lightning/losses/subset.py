@@ -29,7 +29,7 @@ def subset_losses(points: Tensor, samples: Tensor, sizes: Sequence[int]) -> dict
     Returns:
         Scalars by size, in squared units of the coordinates; 0 if every sample is an input point.
     """
-    distances = nearest(coordinates(samples), coordinates(points))[0]
+    distances, _ = nearest(coordinates(samples), coordinates(points))
     return {m: distances[:, :m].mean() for m in sizes}
 
 
@@ -58,16 +58,23 @@ def simplification_losses(
     """
     points = coordinates(points)
     samples = coordinates(samples)
-    to_cloud = nearest(samples, points)[0]
-    losses, begin, from_cloud = {}, 0, None
+    to_cloud, _ = nearest(samples, points)
+    losses = {}
+    begin = 0
+    from_cloud = None
     for m in sorted(set(sizes)):
         # The nearest of the first m is the nearest of the previous size or of the added points.
-        added = nearest(points, samples[:, begin:m])[0]
-        from_cloud = added if from_cloud is None else torch.minimum(from_cloud, added)
+        added, _ = nearest(points, samples[:, begin:m])
+        if from_cloud is None:
+            from_cloud = added
+        else:
+            from_cloud = torch.minimum(from_cloud, added)
         begin = m
-        sample_terms = to_cloud[:, :m].mean(1) + to_cloud[:, :m].amax(1)
+        of_first = to_cloud[:, :m]
+        sample_terms = of_first.mean(1) + of_first.amax(1)
         weight = coverage + coverage_per_point * m
-        losses[m] = (sample_terms + weight * from_cloud.mean(1)).mean()
+        terms = sample_terms + weight * from_cloud.mean(1)
+        losses[m] = terms.mean()
     return losses
 
 
@@ -92,5 +99,10 @@ def overlap_losses(matrix: SamplingMatrix | LocalMatrix, sizes: Sequence[int]) -
     else:
         columns = matrix.dense().mT
         squares = (columns @ columns.mT).square()
-    squares = squares - squares.diagonal(dim1=1, dim2=2).diag_embed()
-    return {m: squares[:, :m, :m].sum((1, 2)).mean() / m for m in sizes}
+    diagonal = squares.diagonal(dim1=1, dim2=2)
+    squares = squares - diagonal.diag_embed()
+    losses = {}
+    for m in sizes:
+        of_clouds = squares[:, :m, :m].sum((1, 2))
+        losses[m] = of_clouds.mean() / m
+    return losses

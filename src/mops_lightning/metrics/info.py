@@ -42,7 +42,8 @@ class MetricInfo(msgspec.Struct, frozen=True, omit_defaults=True):
             metric: the metric or its class.
         """
         declared = [field for field in cls.__struct_fields__ if hasattr(metric, field)]
-        return cls.from_dict(name, {field: getattr(metric, field) for field in declared})
+        values = {field: getattr(metric, field) for field in declared}
+        return cls.from_dict(name, values)
 
     @classmethod
     def from_dict(cls, name: str, values: Mapping[str, Any]) -> Self:
@@ -52,15 +53,20 @@ class MetricInfo(msgspec.Struct, frozen=True, omit_defaults=True):
     def as_dict(self) -> dict[str, Any]:
         """Return what differs from the defaults, without the name, as plain data."""
         plain = msgspec.to_builtins(self)
-        return {name: value for name, value in plain.items() if name != "name"}
+        del plain["name"]
+        return plain
 
     @property
     def title(self) -> str:
         """The label with the unit in brackets."""
         label = self.label or self.name.replace("_", " ")
-        return f"{label} ({self.unit})" if self.unit else label
+        if not self.unit:
+            return label
+        return f"{label} ({self.unit})"
 
     def format(self, value: float) -> str:
         """Return a value in the metric's unit, without the unit."""
         value *= self.scale
-        return f"{value:.2f}" if self.unit else f"{value:.4g}"
+        if self.unit:
+            return f"{value:.2f}"
+        return f"{value:.4g}"

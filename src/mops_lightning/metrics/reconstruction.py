@@ -77,22 +77,27 @@ class NormalizedError(TableMetric):
 
     def __init__(self, **extra: Any) -> None:
         super().__init__(**extra)
+        zero = torch.tensor(0.0).double()
         for state in ("ratios", "sampled", "full", "clouds"):
-            self.add_state(state, default=torch.tensor(0.0).double(), dist_reduce_fx="sum")
+            self.add_state(state, default=zero.clone(), dist_reduce_fx="sum")
 
     def update(self, distances: Distances, reference: Distances) -> None:
         """Add distances of a batch, and the distances of the full clouds' reconstructions."""
         sampled = getattr(distances, self.kind).detach().double()
         full = getattr(reference, self.kind).detach().double()
         # 0/0, an exact reconstruction from sampled points too, counts as 1.
-        self.ratios += torch.where(sampled == full, 1.0, sampled / full).sum()
+        ratios = torch.where(sampled == full, 1.0, sampled / full)
+        self.ratios += ratios.sum()
         self.sampled += sampled.sum()
         self.full += full.sum()
         self.clouds += len(sampled)
 
     def compute(self) -> Tensor:
         """Return the mean ratio or the ratio of means over all clouds so far."""
-        value = self.sampled / self.full if self.of_means else self.ratios / self.clouds
+        if self.of_means:
+            value = self.sampled / self.full
+        else:
+            value = self.ratios / self.clouds
         return value.float()
 
 

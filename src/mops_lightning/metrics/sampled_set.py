@@ -52,7 +52,7 @@ class SubsetDistance(SetMetric):
     @staticmethod
     def measure(points: Tensor, output: SampleOutput, sizes: Sequence[int]) -> BySize:
         """Return the mean squared distance to the nearest input points."""
-        distances = nearest(coordinates(output.points), coordinates(points))[0]
+        distances, _ = nearest(coordinates(output.points), coordinates(points))
         return {m: distances[:, :m].mean(1) for m in sizes}
 
 
@@ -66,7 +66,9 @@ class UniquePoints(SetMetric):
     @staticmethod
     def measure(points: Tensor, output: SampleOutput, sizes: Sequence[int]) -> BySize:
         """Return the numbers of distinct matches."""
-        indices = match(output.points, points) if output.indices is None else output.indices
+        indices = output.indices
+        if indices is None:
+            indices = match(output.points, points)
         return {m: unique_count(indices[:, :m]).to(points.dtype) for m in sizes}
 
 
@@ -85,7 +87,8 @@ class NonzeroPercent(SetMetric):
         if output.matrix is None:
             return None
         counts = output.matrix.nonzero_counts(NONZERO_THRESHOLD)
-        return {m: 100 * counts[:, :m].mean(1) / points.shape[1] for m in sizes}
+        n_points = points.shape[1]
+        return {m: 100 * counts[:, :m].mean(1) / n_points for m in sizes}
 
 
 class OrthogonalityError(SetMetric):
@@ -101,7 +104,8 @@ class OrthogonalityError(SetMetric):
         if output.matrix is None:
             return None
         gram = output.matrix.gram()
-        error = gram - torch.eye(gram.shape[-1]).to(gram)
+        identity = torch.eye(gram.shape[-1]).to(gram)
+        error = gram - identity
         return {m: torch.linalg.matrix_norm(error[:, :m, :m]) for m in sizes}
 
 

@@ -27,14 +27,14 @@ class Patch(nn.Module):
     def __init__(self, codeword: int, channels: Sequence[int]) -> None:
         super().__init__()
         self.lift = nn.Linear(2, codeword)
-        self.layers = nn.Sequential(
-            *linear_norm_relu([codeword, *channels]), nn.Linear(channels[-1], 3)
-        )
+        hidden = linear_norm_relu([codeword, *channels])
+        self.layers = nn.Sequential(*hidden, nn.Linear(channels[-1], 3))
 
     def forward(self, codeword: Tensor, square: Tensor) -> Tensor:
         """Map ``(B, d)`` codewords and ``(B or 1, g, 2)`` points of a square to ``(B, g, 3)``."""
         hidden = self.lift(square) + codeword[:, None]
-        return self.layers(hidden.flatten(0, 1)).unflatten(0, hidden.shape[:2])
+        rows = self.layers(hidden.flatten(0, 1))
+        return rows.unflatten(0, hidden.shape[:2])
 
 
 class AtlasNet(Reconstructor):
@@ -68,7 +68,8 @@ class AtlasNet(Reconstructor):
         check_channels("patch_channels", patch_channels)
         self.n_points = n_points
         self.encoder = PointEncoder(codeword, point_channels=point_channels)
-        self.patches = nn.ModuleList(Patch(codeword, patch_channels) for _ in range(pieces))
+        patches = [Patch(codeword, patch_channels) for _ in range(pieces)]
+        self.patches = nn.ModuleList(patches)
 
     def from_pooled(self, pooled: Tensor, n_points: int | None = None) -> Tensor:
         """Map codewords ``(B, d)`` to ``(B, n, 3)``; ``n_points`` as for ``forward``."""
@@ -77,9 +78,11 @@ class AtlasNet(Reconstructor):
         patches = []
         for patch in self.patches:
             if self.training:
-                square = torch.rand(len(pooled), size, 2, device=pooled.device, dtype=pooled.dtype)
+                shape = (len(pooled), size, 2)
+                square = torch.rand(shape, device=pooled.device, dtype=pooled.dtype)
                 square = (square - 0.5) * 2 * REACH
             else:
                 square = square_grid(size).to(pooled)[None]
             patches.append(patch(pooled, square))
-        return torch.stack(patches, 2).flatten(1, 2)[:, :n]
+        points = torch.stack(patches, 2).flatten(1, 2)
+        return points[:, :n]

@@ -40,7 +40,8 @@ class PointEncoder(nn.Module):
         check_at_least(1, codeword=codeword)
         check_channels("channels", channels)
         self.codeword = codeword
-        self.features = PointMLP([3 + len(self.point_channels), *channels])
+        input_channels = 3 + len(self.point_channels)
+        self.features = PointMLP([input_channels, *channels])
         self.pool = PointMaxPool(channels[-1], codeword)
 
     def forward(self, points: Tensor) -> Tensor:
@@ -111,10 +112,9 @@ class AutoEncoder(Reconstructor):
         check_channels("encoder_channels", encoder_channels)
         self.n_points = n_points
         self.encoder = PointEncoder(codeword, encoder_channels, point_channels)
-        self.decoder = nn.Sequential(
-            *linear_norm_relu([codeword, *DECODER_CHANNELS], norm=False),
-            nn.Linear(DECODER_CHANNELS[-1], 3 * n_points),
-        )
+        hidden = linear_norm_relu([codeword, *DECODER_CHANNELS], norm=False)
+        last = nn.Linear(DECODER_CHANNELS[-1], 3 * n_points)
+        self.decoder = nn.Sequential(*hidden, last)
 
     def from_pooled(self, pooled: Tensor, n_points: int | None = None) -> Tensor:
         """Map codewords ``(B, d)`` to ``(B, n, 3)``.

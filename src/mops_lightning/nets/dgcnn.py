@@ -46,10 +46,12 @@ class EdgeConv(nn.Module):
         """
         n = features.shape[1]
         with torch.no_grad():
-            rows = torch.cdist(places, places).topk(min(self.k, n), largest=False).indices
+            distances = torch.cdist(places, places)
+            rows = distances.topk(min(self.k, n), largest=False).indices
         edges = self.edge(features)
         mixed = self.own(features) - edges + max_of_rows(edges, rows)
-        return F.relu(self.norm(mixed.flatten(0, 1))).unflatten(0, (-1, n))
+        rows_of_all = mixed.flatten(0, 1)
+        return F.relu(self.norm(rows_of_all)).unflatten(0, (-1, n))
 
 
 class DGCNN(nn.Module):
@@ -82,8 +84,11 @@ class DGCNN(nn.Module):
         check_at_least(1, k=k)
         check_channels("edge_channels", edge_channels)
         first = 3 + len(self.point_channels)
-        sizes = zip([first, *edge_channels[:-1]], edge_channels, strict=True)
-        self.edges = nn.ModuleList(EdgeConv(before, after, k) for before, after in sizes)
+        before = [first, *edge_channels[:-1]]
+        layers = []
+        for channels_in, channels_out in zip(before, edge_channels, strict=True):
+            layers.append(EdgeConv(channels_in, channels_out, k))
+        self.edges = nn.ModuleList(layers)
         self.pool = PointMaxPool(sum(edge_channels), 1024)
         self.head = classifier_head(num_classes, dropout)
 

@@ -47,8 +47,14 @@ def square_grid(n: int) -> Tensor:
     if rows * rows * 4 < n:
         rows = math.isqrt(n - 1) + 1
     columns = -(-n // rows)
-    ticks = [torch.linspace(-REACH, REACH, k) if k > 1 else torch.zeros(1) for k in (rows, columns)]
-    return torch.cartesian_prod(*ticks)[:n]
+    grid = torch.cartesian_prod(_ticks(rows), _ticks(columns))
+    return grid[:n]
+
+
+def _ticks(number: int) -> Tensor:
+    if number == 1:
+        return torch.zeros(1)
+    return torch.linspace(-REACH, REACH, number)
 
 
 class Fold(nn.Module):
@@ -65,11 +71,13 @@ class Fold(nn.Module):
 
     def __init__(self, piece: int, coordinates: int, channels: Sequence[int]) -> None:
         super().__init__()
-        sizes = [*channels, 3]
-        self.from_piece = nn.Linear(piece, sizes[0])
-        self.from_coordinates = nn.Linear(coordinates, sizes[0], bias=False)
-        self.narrow = nn.Linear(sizes[0], sizes[1])
-        rest = [nn.Sequential(nn.ReLU(), nn.Linear(*both)) for both in pairwise(sizes[1:])]
+        first, second, *others = (*channels, 3)
+        self.from_piece = nn.Linear(piece, first)
+        self.from_coordinates = nn.Linear(coordinates, first, bias=False)
+        self.narrow = nn.Linear(first, second)
+        rest = []
+        for before, after in pairwise([second, *others]):
+            rest.append(nn.Sequential(nn.ReLU(), nn.Linear(before, after)))
         self.rest = nn.Sequential(*rest)
 
     def forward(self, pieces: Tensor, coordinates: Tensor) -> Tensor:
@@ -78,7 +86,8 @@ class Fold(nn.Module):
         offsets = self.from_piece(pieces)
         others = (coordinates, self.from_coordinates.weight, narrow.weight, narrow.bias)
         # Under autocast, only the offsets would be in half precision.
-        return self.rest(_WideLayer.apply(offsets, *(other.to(offsets) for other in others)))
+        like_offsets = [other.to(offsets) for other in others]
+        return self.rest(_WideLayer.apply(offsets, *like_offsets))
 
 
 class _WideLayer(Function):
@@ -91,13 +100,21 @@ class _WideLayer(Function):
 
     @staticmethod
     def forward(
-        ctx: Any, offsets: Tensor, coordinates: Tensor, inner: Tensor, outer: Tensor, bias: Tensor
+        ctx: Any,
+        offsets: Tensor,
+        coordinates: Tensor,
+        inner: Tensor,
+        outer: Tensor,
+        bias: Tensor,
     ) -> Tensor:
         ctx.save_for_backward(offsets, coordinates, inner, outer)
-        result = offsets.new_empty(len(offsets), coordinates.shape[1], len(outer))
+        grid = coordinates.shape[1]
+        result = offsets.new_empty(len(offsets), grid, len(outer))
         for p, g in _blocks(result):
-            hidden = _hidden(offsets[p], _part(coordinates, p, g), inner)
-            result[p, g] = torch.addmm(bias, hidden.flatten(0, 1), outer.T).view_as(result[p, g])
+            places = _part(coordinates, p, g)
+            hidden = _hidden(offsets[p], places, inner)
+            rows = torch.addmm(bias, hidden.flatten(0, 1), outer.T)
+            result[p, g] = rows.view_as(result[p, g])
         return result
 
     @staticmethod
@@ -108,8 +125,9 @@ class _WideLayer(Function):
         d_offsets = torch.zeros_like(offsets)
         d_inner = torch.zeros_like(inner.T)
         d_outer = torch.zeros_like(outer)
-        wanted = ctx.needs_input_grad[1]
-        d_coordinates = torch.zeros_like(coordinates) if wanted else None
+        d_coordinates = None
+        if ctx.needs_input_grad[1]:
+            d_coordinates = torch.zeros_like(coordinates)
         for p, g in _blocks(grad):
             places = _part(coordinates, p, g)
             hidden = _hidden(offsets[p], places, inner)
@@ -119,14 +137,18 @@ class _WideLayer(Function):
             d_hidden = torch.ops.aten.threshold_backward(d_hidden, hidden, 0)
             # One product gives the sum over the grid and the gradient of W; narrow ones are slow.
             ones = places.new_ones(*places.shape[:2], 1)
-            both = torch.cat([places, ones], 2).mT.expand(len(d_hidden), -1, -1) @ d_hidden
+            extended = torch.cat([places, ones], 2).mT
+            both = extended.expand(len(d_hidden), -1, -1) @ d_hidden
             d_inner += both[:, :-1].sum(0)
             d_offsets[p] += both[:, -1]
             if d_coordinates is not None:
                 part = (d_hidden.flatten(0, 1) @ inner).view(*d_hidden.shape[:2], -1)
-                shared = len(coordinates) == 1
-                _part(d_coordinates, p, g).add_(part.sum(0, keepdim=True) if shared else part)
-        d_bias = grad.sum((0, 1)) if ctx.needs_input_grad[4] else None
+                if len(coordinates) == 1:  # all pieces share it
+                    part = part.sum(0, keepdim=True)
+                _part(d_coordinates, p, g).add_(part)
+        d_bias = None
+        if ctx.needs_input_grad[4]:
+            d_bias = grad.sum((0, 1))
         return d_offsets, d_coordinates, d_inner.T, d_outer, d_bias
 
 
@@ -138,17 +160,21 @@ def _blocks(result: Tensor) -> Iterator[tuple[slice, slice]]:
     per_piece = max(1, rows // per_grid)
     for first in range(0, pieces, per_piece):
         for begin in range(0, grid, per_grid):
-            yield slice(first, first + per_piece), slice(begin, begin + per_grid)
+            some_pieces = slice(first, first + per_piece)
+            yield some_pieces, slice(begin, begin + per_grid)
 
 
 def _part(coordinates: Tensor, pieces: slice, grid: slice) -> Tensor:
     """Return a block of coordinates, which all pieces may share."""
-    return coordinates[:, grid] if len(coordinates) == 1 else coordinates[pieces, grid]
+    if len(coordinates) == 1:
+        return coordinates[:, grid]
+    return coordinates[pieces, grid]
 
 
 def _hidden(offsets: Tensor, coordinates: Tensor, inner: Tensor) -> Tensor:
     """Return the wide hidden layer of a block, ``(p, g, w)``."""
-    return (coordinates @ inner.T).add(offsets[:, None]).relu_()
+    hidden = (coordinates @ inner.T).add(offsets[:, None])
+    return hidden.relu_()
 
 
 class FoldingDecoder(nn.Module):
@@ -185,10 +211,13 @@ class FoldingDecoder(nn.Module):
         """
         if n_points < self.pieces:
             raise UserError(f"n_points must be at least pieces={self.pieces}, got {n_points}.")
-        grid = square_grid(-(-n_points // self.pieces)).to(codeword)
-        pieces = codeword.reshape(len(codeword) * self.pieces, -1)
+        points_of_piece = -(-n_points // self.pieces)
+        grid = square_grid(points_of_piece).to(codeword)
+        clouds = len(codeword)
+        pieces = codeword.reshape(clouds * self.pieces, -1)
         folded = self.second(pieces, self.first(pieces, grid[None]))
-        by_grid_point = folded.unflatten(0, (len(codeword), self.pieces)).transpose(1, 2)
+        by_piece = folded.unflatten(0, (clouds, self.pieces))
+        by_grid_point = by_piece.transpose(1, 2)
         return by_grid_point.flatten(1, 2)[:, :n_points]
 
 

@@ -66,7 +66,12 @@ class Stage(nn.Module):
     """
 
     def __init__(
-        self, sampler: nn.Module, m: int, channels_in: int, channels_out: int, k: int
+        self,
+        sampler: nn.Module,
+        m: int,
+        channels_in: int,
+        channels_out: int,
+        k: int,
     ) -> None:
         super().__init__()
         self.sampler: Any = sampler
@@ -88,19 +93,14 @@ class Stage(nn.Module):
             UserError: the stage's sampler returns m points only, and N is below m.
         """
         n = points.shape[1]
-        if n < self.m and not getattr(self.sampler, "flexible", True):
+        is_flexible = getattr(self.sampler, "flexible", True)
+        if n < self.m and not is_flexible:
             raise UserError(
                 f"task.net.points must be at most the {n} points that the net is given, because "
                 f"its {type(self.sampler).__name__} returns {self.m} points only. Lower it, or "
                 "choose sampler@task.net.sampler=fps."
             )
-        sizes = self.sampler.training_sizes() if self.training else (self.m,)
-        m = min(max(sizes), n)
-        output: SampleOutput
-        if isinstance(self.sampler, FeatureSampler):
-            output = self.sampler.by_features(points, features, m)
-        else:
-            output = self.sampler(points, m)
+        output = self._sampled(points, features)
         centres = output.points
         rows = k_nearest_rows(centres, points, min(self.k, n))
         self.losses = output.losses
@@ -111,10 +111,21 @@ class Stage(nn.Module):
         r = root_mean_square(offset_moments)
         scale = torch.cat([r, r, r, *[r * r] * 9], 2)
         edges = max_of_rows(self.feature(features) + self.offset(points / r), rows)
-        edges = edges - self.offset(centres / r) + self.centre(carried(output, points, features))
+        edges = edges - self.offset(centres / r)
+        edges = edges + self.centre(carried(output, points, features))
         edges = edges + self.moments(offset_moments / scale)
-        mixed = F.relu(self.norm(edges.flatten(0, 1))).unflatten(0, centres.shape[:2])
+        activated = F.relu(self.norm(edges.flatten(0, 1)))
+        mixed = activated.unflatten(0, centres.shape[:2])
         return centres, mixed + self.mlp(mixed).to(mixed)
+
+    def _sampled(self, points: Tensor, features: Tensor) -> SampleOutput:
+        sizes = (self.m,)
+        if self.training:
+            sizes = self.sampler.training_sizes()
+        m = min(max(sizes), points.shape[1])
+        if isinstance(self.sampler, FeatureSampler):
+            return self.sampler.by_features(points, features, m)
+        return self.sampler(points, m)
 
 
 def root_mean_square(offset_moments: Tensor) -> Tensor:
@@ -142,8 +153,10 @@ def carried(output: SampleOutput, points: Tensor, features: Tensor) -> Tensor:
     if output.indices is not None:
         return gather_points(features, output.indices)
     if output.matrix is not None:
-        return output.matrix.sample(features.to(output.matrix.dtype))
-    return gather_points(features, nearest(output.points, points)[1])
+        values = features.to(output.matrix.dtype)
+        return output.matrix.sample(values)
+    _, rows = nearest(output.points, points)
+    return gather_points(features, rows)
 
 
 class Hierarchy(nn.Module):
@@ -184,21 +197,23 @@ class Hierarchy(nn.Module):
                 f"{len(channels)}."
             )
         accepted = inspect.signature(sampler).parameters
-        size = "m_max" if "m_max" in accepted else "m"
-
-        def make(m: int, before: int) -> nn.Module:
-            host = {"channels": before} if "channels" in accepted else {}
-            return sampler(**{size: m}, **host)
-
-        self.stem = PointMLP([3 + len(self.point_channels), channels[0], channels[0]])
-        self.stages = nn.ModuleList(
-            Stage(make(m, before), m, before, after, k)
-            for m, (before, after) in zip(points, pairwise(channels), strict=True)
-        )
+        size = "m"
+        if "m_max" in accepted:
+            size = "m_max"
+        first = channels[0]
+        self.stem = PointMLP([3 + len(self.point_channels), first, first])
+        stages = []
+        for m, (before, after) in zip(points, pairwise(channels), strict=True):
+            settings = {size: m}
+            if "channels" in accepted:
+                settings["channels"] = before
+            stages.append(Stage(sampler(**settings), m, before, after, k))
+        self.stages = nn.ModuleList(stages)
 
     def levels(self, points: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Return places ``(B, M, 3)`` and their features ``(B, M, C)``: the input, every stage."""
-        levels = [(coordinates(points), self.stem(points).to(points))]
+        features = self.stem(points).to(points)
+        levels = [(coordinates(points), features)]
         for stage in self.stages:
             levels.append(stage(*levels[-1]))
         return levels
@@ -209,7 +224,8 @@ class Hierarchy(nn.Module):
         losses: dict[str, Tensor] = {}
         for i, stage in enumerate(self.stages, 1):
             assert isinstance(stage, Stage)
-            losses |= {f"stage{i}_{name}": loss for name, loss in stage.losses.items()}
+            for name, loss in stage.losses.items():
+                losses[f"stage{i}_{name}"] = loss
         return losses
 
 
@@ -252,9 +268,10 @@ class HierarchicalNet(Hierarchy):
 
     def forward(self, points: Tensor) -> Tensor:
         """Map ``(B, N, 3 + C)`` points to ``(B, num_classes)`` logits."""
-        stages = [features for _, features in self.levels(points)[1:]]
-        peaks = [features.amax(1) for features in stages]
-        return self.head(torch.cat([*peaks, stages[-1].mean(1)], 1))
+        stages = self.levels(points)[1:]
+        peaks = [features.amax(1) for _, features in stages]
+        _, deepest = stages[-1]
+        return self.head(torch.cat([*peaks, deepest.mean(1)], 1))
 
 
 class HierarchicalSegmentation(Hierarchy):
@@ -284,16 +301,20 @@ class HierarchicalSegmentation(Hierarchy):
         super().__init__(sampler, points, channels, k, point_channels)
         # The deepest level also knows the whole cloud, by the maximum of its features.
         sizes = [2 * channels[-1], *reversed(channels[:-1])]
-        self.back = nn.ModuleList(PointMLP([deep + skip, skip]) for deep, skip in pairwise(sizes))
-        self.head = nn.Sequential(nn.Dropout(dropout), nn.Linear(channels[0], num_parts))
+        layers = [PointMLP([deep + skip, skip]) for deep, skip in pairwise(sizes)]
+        self.back = nn.ModuleList(layers)
+        last = nn.Linear(channels[0], num_parts)
+        self.head = nn.Sequential(nn.Dropout(dropout), last)
 
     def forward(self, points: Tensor) -> Tensor:
         """Map ``(B, N, 3 + C)`` points to ``(B, N, num_parts)`` logits."""
         *before, (centres, features) = self.levels(points)
         peaks = features.amax(1, keepdim=True).expand_as(features)
         features = torch.cat([features, peaks], 2)
-        for layer, (target, skip) in zip(self.back, reversed(before), strict=True):
+        before.reverse()
+        for layer, (target, skip) in zip(self.back, before, strict=True):
             carried_back = interpolate(features, centres, target)
-            features = layer(torch.cat([carried_back, skip], 2)).to(points)
+            both = torch.cat([carried_back, skip], 2)
+            features = layer(both).to(points)
             centres = target
         return self.head(features)

@@ -25,7 +25,9 @@ def check_channels(name: str, channels: Sequence[int], min_layers: int = 1) -> N
         UserError: there are fewer layers, or a layer has no channels.
     """
     if len(channels) < min_layers or min(channels) < 1:
-        layers = "layer" if min_layers == 1 else "layers"
+        layers = "layers"
+        if min_layers == 1:
+            layers = "layer"
         raise UserError(
             f"{name} must be sizes of at least {min_layers} {layers}, each at least 1, "
             f"got {list(channels)}."
@@ -45,9 +47,10 @@ def linear_norm_relu(channels: Sequence[int], norm: bool = True) -> nn.Sequentia
     """
     layers: list[nn.Module] = []
     for before, after in pairwise(channels):
-        layers += [nn.Linear(before, after, bias=not norm)]
-        layers += [nn.BatchNorm1d(after)] if norm else []
-        layers += [nn.ReLU(inplace=True)]
+        layers.append(nn.Linear(before, after, bias=not norm))
+        if norm:
+            layers.append(nn.BatchNorm1d(after))
+        layers.append(nn.ReLU(inplace=True))
     return nn.Sequential(*layers)
 
 
@@ -70,9 +73,11 @@ class PointMLP(nn.Module):
         """Map ``(B, N, channels[0])`` to ``(B, N, channels[-1])``."""
         rows = features.flatten(0, 1)
         if pointwise_autocast_dtype() is None:
-            return self.layers(rows).unflatten(0, features.shape[:2])
+            rows = self.layers(rows)
+            return rows.unflatten(0, features.shape[:2])
         first, *others = self.layers.children()
-        rows = first(rows.to(next(first.parameters())))
+        weight = next(first.parameters())
+        rows = first(rows.to(weight))
         with pointwise_autocast(rows.device.type):
             for layer in others:
                 rows = layer(rows)

@@ -33,7 +33,9 @@ class PointMaxPool(nn.Module):
     def __init__(self, channels_in: int, channels_out: int, norm: bool = True) -> None:
         super().__init__()
         self.linear = nn.Linear(channels_in, channels_out, bias=not norm)
-        self.norm = nn.BatchNorm1d(channels_out) if norm else None
+        self.norm: nn.BatchNorm1d | None = None
+        if norm:
+            self.norm = nn.BatchNorm1d(channels_out)
 
     def forward(self, features: Tensor) -> Tensor:
         """Map ``(B, N, channels_in)`` to ``(B, channels_out)`` in the dtype of the weights."""
@@ -45,11 +47,14 @@ class PointMaxPool(nn.Module):
             return self.values(features).amax(1)
         if self.norm is None:
             increasing = torch.zeros_like(self.linear.bias, dtype=torch.bool)
-            return F.relu(self._extremes(features, increasing) + self.linear.bias)
+            extremes = self._extremes(features, increasing)
+            return F.relu(extremes + self.linear.bias)
         mean, scale = self._mean_and_scale(self.norm, features)
-        extremes = self._extremes(features, (scale < 0).detach())
+        is_decreasing = (scale < 0).detach()
+        extremes = self._extremes(features, is_decreasing)
         assert self.norm.bias is not None
-        return F.relu((extremes - mean) * scale + self.norm.bias)
+        normalised = (extremes - mean) * scale
+        return F.relu(normalised + self.norm.bias)
 
     def values(self, features: Tensor) -> Tensor:
         """Return what the maximum is taken of: ``(B, N, channels_out)``, non-negative.
@@ -57,8 +62,10 @@ class PointMaxPool(nn.Module):
         Args:
             features: as for ``forward``.
         """
-        rows = self.linear(features.to(self.linear.weight).flatten(0, 1))
-        rows = rows if self.norm is None else self.norm(rows)
+        features = features.to(self.linear.weight)
+        rows = self.linear(features.flatten(0, 1))
+        if self.norm is not None:
+            rows = self.norm(rows)
         return rows.relu_().unflatten(0, features.shape[:2])
 
     def _mean_and_scale(self, norm: nn.BatchNorm1d, features: Tensor) -> tuple[Tensor, Tensor]:
@@ -77,22 +84,27 @@ class PointMaxPool(nn.Module):
             mean = weight @ centre
             variance = ((weight @ covariance) * weight).sum(1)
             with torch.no_grad():
-                momentum = 0.1 if norm.momentum is None else norm.momentum
-                unbiased = variance * (rows.shape[0] / max(rows.shape[0] - 1, 1))
+                momentum = 0.1
+                if norm.momentum is not None:
+                    momentum = norm.momentum
+                number = rows.shape[0]
+                unbiased = variance * (number / max(number - 1, 1))
                 # As BatchNorm's own update, this must not count as an in-place change: a call with
                 # few points in the same step has saved these tensors for its backward pass.
-                norm.running_mean.data.lerp_(mean.to(norm.running_mean.dtype), momentum)
-                norm.running_var.data.lerp_(unbiased.to(norm.running_var.dtype), momentum)
+                norm.running_mean.data.lerp_(mean.to(norm.running_mean), momentum)
+                norm.running_var.data.lerp_(unbiased.to(norm.running_var), momentum)
                 if norm.num_batches_tracked is not None:
                     norm.num_batches_tracked += 1
-        return mean, norm.weight * torch.rsqrt(variance + norm.eps)
+        scale = norm.weight * torch.rsqrt(variance + norm.eps)
+        return mean, scale
 
     def _extremes(self, features: Tensor, decreasing: Tensor) -> Tensor:
         """Return the maximum, or for decreasing channels the minimum, of the product ``(B, C)``."""
         weight = self.linear.weight
         sign = torch.where(decreasing, -1.0, 1.0).to(weight)
         signed = (sign[:, None] * weight).to(features)
-        return sign * _MaxOverPoints.apply(features, signed).to(weight)
+        extremes = _MaxOverPoints.apply(features, signed)
+        return sign * extremes.to(weight)
 
 
 class _MaxOverPoints(Function):
@@ -107,17 +119,20 @@ class _MaxOverPoints(Function):
     def forward(ctx: Any, features: Tensor, weight: Tensor) -> Tensor:
         clouds, n, _ = features.shape
         if not any(ctx.needs_input_grad):
-            return torch.stack([(weight @ cloud.mT).amax(1) for cloud in features])
+            maxima = [(weight @ cloud.mT).amax(1) for cloud in features]
+            return torch.stack(maxima)
         if features.is_cuda:
             extremes, winners = (weight @ features.mT).max(2)
         else:  # cloud by cloud, the product stays in the cache
-            padded = torch.cat([features, features[:, :1].expand(-1, -n % GROUP, -1)], 1)
+            copies = features[:, :1].expand(-1, -n % GROUP, -1)
+            padded = torch.cat([features, copies], 1)
             extremes = features.new_empty(clouds, len(weight))
             winners = torch.empty(clouds, len(weight), dtype=torch.int64)
             for cloud, values, rows in zip(padded, extremes, winners, strict=True):
                 product = weight @ cloud.mT
                 place = blocked_argmax(product)
-                values.copy_(product.gather(1, place)[:, 0])
+                largest = product.gather(1, place)
+                values.copy_(largest[:, 0])
                 rows.copy_(place[:, 0])
             # A padding copy can exceed the first point by a rounding error of the product.
             winners.masked_fill_(winners >= n, 0)
@@ -137,30 +152,29 @@ class _MaxOverPoints(Function):
         clouds, n, _ = features.shape
         channels = len(weight)
         to_features = to_weight = None
-        places = winners + torch.arange(clouds, device=winners.device)[:, None] * n
+        starts_of_clouds = torch.arange(clouds, device=winners.device) * n
+        places = winners + starts_of_clouds[:, None]
         if ctx.needs_input_grad[0]:
             places_sorted, order = places.flatten().sort()
-            starts = torch.searchsorted(
-                places_sorted, torch.arange(clouds * n, device=places.device)
-            )
-            to_features = F.embedding_bag(
+            all_places = torch.arange(clouds * n, device=places.device)
+            starts = torch.searchsorted(places_sorted, all_places)
+            sums = F.embedding_bag(
                 order % channels,
                 weight,
                 starts,
                 mode="sum",
                 per_sample_weights=gradient.flatten()[order],
-            ).view_as(features)
+            )
+            to_features = sums.view_as(features).to(dtype)
         if ctx.needs_input_grad[1]:
-            to_weight = F.embedding_bag(
+            sums = F.embedding_bag(
                 places.T.contiguous(),
                 features.flatten(0, 1),
                 mode="sum",
                 per_sample_weights=gradient.T.contiguous(),
             )
-        return (
-            None if to_features is None else to_features.to(dtype),
-            None if to_weight is None else to_weight.to(dtype),
-        )
+            to_weight = sums.to(dtype)
+        return to_features, to_weight
 
 
 def blocked_argmax(values: Tensor) -> Tensor:
@@ -177,5 +191,6 @@ def blocked_argmax(values: Tensor) -> Tensor:
     """
     groups = values.view(len(values), -1, GROUP)
     group = groups.amax(2).argmax(1, keepdim=True)
-    winners = groups.gather(1, group[..., None].expand(-1, 1, GROUP))
+    rows = group[..., None].expand(-1, 1, GROUP)
+    winners = groups.gather(1, rows)
     return winners.argmax(2).add_(group, alpha=GROUP)

@@ -53,9 +53,10 @@ class PCRNet(nn.Module):
         check_channels("feature_channels", feature_channels, 2)
         self.iterations = iterations
         first = 3 + len(self.point_channels)
-        self.features = PointMLP([first, *feature_channels[:-1]], norm=False)
-        self.pool = PointMaxPool(feature_channels[-2], feature_channels[-1], norm=False)
-        self.head = linear_norm_relu([2 * feature_channels[-1], *HEAD_CHANNELS], norm=False)
+        *hidden, before, width = feature_channels
+        self.features = PointMLP([first, *hidden, before], norm=False)
+        self.pool = PointMaxPool(before, width, norm=False)
+        self.head = linear_norm_relu([2 * width, *HEAD_CHANNELS], norm=False)
         self.motion = nn.Linear(HEAD_CHANNELS[-1], 7)
         for module in self.modules():
             if isinstance(module, nn.Linear) and module is not self.motion:
@@ -78,17 +79,22 @@ class PCRNet(nn.Module):
             if of_target is not None:
                 moved = move(source, total, self.point_channels)
             if of_target is None and source.shape == target.shape:
-                of_source, of_target = self._global(torch.cat([moved, target])).chunk(2)
+                both = self._global(torch.cat([moved, target]))
+                of_source, of_target = both.chunk(2)
             else:
                 of_source = self._global(moved)
-                of_target = self._global(target) if of_target is None else of_target
-            total = self._step(of_source, of_target, source).after(total)
+                if of_target is None:
+                    of_target = self._global(target)
+            step = self._step(of_source, of_target, source)
+            total = step.after(total)
         return total
 
     def _step(self, of_source: Tensor, of_target: Tensor, like: Tensor) -> Motion:
         """Return the motion of one pass, in the dtype of ``like``, from both global features."""
-        predicted = self.motion(self.head(torch.cat([of_source, of_target], 1))).to(like)
-        return Motion(F.normalize(predicted[:, :4], dim=1), predicted[:, 4:])
+        hidden = self.head(torch.cat([of_source, of_target], 1))
+        predicted = self.motion(hidden).to(like)
+        quaternion = F.normalize(predicted[:, :4], dim=1)
+        return Motion(quaternion, translation=predicted[:, 4:])
 
     def point_features(self, points: Tensor) -> Tensor:
         """Return the features ``(B, N, C)`` of one cloud whose maxima over points the head takes.

@@ -62,11 +62,16 @@ class PlaneICP(nn.Module):
         moved = motion.apply(source)
         rows, distance = nearest_rows(moved, target)
         across = gather_points(normals, rows)
-        residuals = ((moved - gather_points(target, rows)) * across).sum(2)
-        levers = torch.cat([torch.linalg.cross(moved, across), across], 2)
+        apart = moved - gather_points(target, rows)
+        residuals = (apart * across).sum(2)
+        turns = torch.linalg.cross(moved, across)
+        levers = torch.cat([turns, across], 2)
         is_near = (distance <= self.max_distance).to(moved)
-        step = weighted_step(levers.double(), residuals.double(), is_near.double()).to(moved)
-        return motion_of_vectors(step[:, :3], step[:, 3:]).after(motion)
+        step = weighted_step(levers.double(), residuals.double(), is_near.double())
+        step = step.to(moved)
+        turn = step[:, :3]
+        shift = step[:, 3:]
+        return motion_of_vectors(turn, shift).after(motion)
 
 
 def weighted_step(levers: Tensor, residuals: Tensor, weights: Tensor) -> Tensor:
@@ -78,9 +83,11 @@ def weighted_step(levers: Tensor, residuals: Tensor, weights: Tensor) -> Tensor:
         weights: ``(B, M)`` the weights w, of at least 0.
     """
     weighted = levers * weights[..., None]
-    matrix = weighted.mT @ levers + DAMPING * torch.eye(6, dtype=levers.dtype, device=levers.device)
+    damping = DAMPING * torch.eye(6, dtype=levers.dtype, device=levers.device)
+    matrix = weighted.mT @ levers + damping
     pull = weighted.mT @ residuals[..., None]
-    return -torch.linalg.solve(matrix, pull)[..., 0]
+    solution = torch.linalg.solve(matrix, pull)
+    return -solution[..., 0]
 
 
 @torch.no_grad()
@@ -99,5 +106,5 @@ def nearest_rows(points: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
 def surface_normals(points: Tensor) -> Tensor:
     """Return estimated unit normals ``(B, N, 3)`` of clouds, of either sign."""
     clouds = points.double().cpu().numpy()
-    normals = np.stack([estimate_normals(cloud, NEIGHBOURS) for cloud in clouds])
-    return torch.from_numpy(normals).to(points)
+    normals = [estimate_normals(cloud, NEIGHBOURS) for cloud in clouds]
+    return torch.from_numpy(np.stack(normals)).to(points)

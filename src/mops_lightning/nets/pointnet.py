@@ -20,7 +20,9 @@ def classifier_head(num_classes: int, dropout: float) -> nn.Sequential:
         dropout: dropout probability before the last layer.
     """
     return nn.Sequential(
-        *linear_norm_relu([1024, 512, 256]), nn.Dropout(dropout), nn.Linear(256, num_classes)
+        *linear_norm_relu([1024, 512, 256]),
+        nn.Dropout(dropout),
+        nn.Linear(256, num_classes),
     )
 
 
@@ -41,7 +43,8 @@ class PointNetVanilla(nn.Module):
     ) -> None:
         super().__init__()
         self.point_channels = PointChannels.of(point_channels)
-        self.features = PointMLP([3 + len(self.point_channels), 64, 64, 64, 128])
+        input_channels = 3 + len(self.point_channels)
+        self.features = PointMLP([input_channels, 64, 64, 64, 128])
         self.pool = PointMaxPool(128, 1024)
         self.head = classifier_head(num_classes, dropout)
 
@@ -65,10 +68,10 @@ class TransformNet(nn.Module):
         super().__init__()
         self.features = PointMLP([size, 64, 128])
         self.pool = PointMaxPool(128, 1024)
-        self.head = nn.Sequential(*linear_norm_relu([1024, 512, 256]), nn.Linear(256, size * size))
+        hidden = linear_norm_relu([1024, 512, 256])
+        last = nn.Linear(256, size * size)
+        self.head = nn.Sequential(*hidden, last)
         self.size = size
-        last = self.head[-1]
-        assert isinstance(last, nn.Linear)
         nn.init.zeros_(last.weight)
         with torch.no_grad():
             last.bias.copy_(torch.eye(size).flatten())
@@ -96,7 +99,8 @@ class PointNetTransform(nn.Module):
     ) -> None:
         super().__init__()
         self.point_channels = PointChannels.of(point_channels)
-        self.first = PointMLP([3 + len(self.point_channels), 64, 64])
+        input_channels = 3 + len(self.point_channels)
+        self.first = PointMLP([input_channels, 64, 64])
         self.point_transform = TransformNet(3)
         self.feature_transform = TransformNet(64)
         self.features = PointMLP([64, 64, 128])

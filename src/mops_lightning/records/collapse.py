@@ -28,19 +28,23 @@ def distinct_points(record: RunRecord) -> dict[int, float]:
         name = parse_metric_name(key)
         if name is None or name.metric != UNIQUE or value is None:
             continue
-        counts[name.m or record.config["m"]] = value
+        m = name.m or record.config["m"]
+        counts[m] = value
     return counts
 
 
 def collapsed(record: RunRecord) -> dict[int, float]:
     """Return the sizes at which a run's sampler has collapsed, with its distinct points."""
-    return {m: count for m, count in distinct_points(record).items() if count < FEWEST * m}
+    counts = distinct_points(record)
+    return {m: count for m, count in counts.items() if count < FEWEST * m}
 
 
 def advice(record: RunRecord) -> str:
     """Return what to try: a penalty on equal choices, where the sampler has one."""
     sampler = record.config.get("sampler") or {}
-    return TRY_OVERLAP if "overlap" in sampler else TRY_COMPLETED
+    if "overlap" in sampler:
+        return TRY_OVERLAP
+    return TRY_COMPLETED
 
 
 def collapse_line(record: RunRecord) -> str:
@@ -48,5 +52,6 @@ def collapse_line(record: RunRecord) -> str:
     found = collapsed(record)
     if not found:
         return ""
-    counts = ", ".join(f"{count:.1f} of {m}" for m, count in found.items())
+    texts = [f"{count:.1f} of {m}" for m, count in found.items()]
+    counts = ", ".join(texts)
     return f"collapsed: only {counts} matched points are distinct. {advice(record)}."

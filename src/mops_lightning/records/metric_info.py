@@ -11,7 +11,9 @@ PACKAGE = "mops_lightning."
 """Where the metrics are whose classes a report knows."""
 
 
-def foreign_metrics(metrics: Iterable[tuple[str, object]]) -> dict[str, dict[str, Any]]:
+def foreign_metrics(
+    metrics: Iterable[tuple[str, object]],
+) -> dict[str, dict[str, Any]]:
     """Return label, unit and direction of the metrics that this package does not know.
 
     Args:
@@ -25,7 +27,8 @@ def foreign_metrics(metrics: Iterable[tuple[str, object]]) -> dict[str, dict[str
         is_of_package = type(metric).__module__.startswith(PACKAGE)
         is_known = is_of_package and getattr(metric, "name", "") == name
         if not is_known:
-            described[name] = MetricInfo.of(name, metric).as_dict()
+            info = MetricInfo.of(name, metric)
+            described[name] = info.as_dict()
     return described
 
 
@@ -41,13 +44,18 @@ def metric_info(name: str, records: Iterable[RunRecord] = ()) -> MetricInfo:
         values = record.metric_info.get(name)
         if values is not None:
             return MetricInfo.from_dict(name, values)
-    return _package_metrics().get(name, MetricInfo(name))
+    unknown = MetricInfo(name)
+    return _package_metrics().get(name, unknown)
 
 
 def in_summary_order(infos: Iterable[MetricInfo]) -> list[MetricInfo]:
     """Return the metrics of the table that ends a run, in its order."""
     shown = [info for info in infos if info.summary_order is not None]
-    return sorted(shown, key=lambda info: (info.summary_order or 0, info.name))
+    return sorted(shown, key=_summary_key)
+
+
+def _summary_key(info: MetricInfo) -> tuple[int, str]:
+    return info.summary_order or 0, info.name
 
 
 @cache

@@ -40,7 +40,9 @@ class MetricName(NamedTuple):
 
 def size_prefix(m: int | None) -> str:
     """Return ``m32/`` for 32, and an empty string for None."""
-    return "" if m is None else f"m{m}/"
+    if m is None:
+        return ""
+    return f"m{m}/"
 
 
 def parse_metric_name(name: str) -> MetricName | None:

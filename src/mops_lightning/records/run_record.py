@@ -204,7 +204,8 @@ class RunRecord:
     def begin(cls, config: dict[str, Any], overrides: list[str], seed: int) -> "RunRecord":
         """Return the record of a run that starts now on this machine."""
         started = datetime.now(UTC).isoformat(timespec="seconds")
-        return cls(config=config, overrides=overrides, seed=seed, started=started, **environment())
+        facts = environment()
+        return cls(config=config, overrides=overrides, seed=seed, started=started, **facts)
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
@@ -213,7 +214,8 @@ class RunRecord:
         try:
             yield
         finally:
-            self.seconds[stage] = round(time.perf_counter() - start, 3)
+            elapsed = time.perf_counter() - start
+            self.seconds[stage] = round(elapsed, 3)
 
     def plain(self) -> dict[str, Any]:
         """Return the record as plain data, as ``result.json`` holds it."""
@@ -222,7 +224,9 @@ class RunRecord:
     @property
     def is_edited(self) -> bool:
         """Whether the record was changed after it was written; False for one without a digest."""
-        return self.digest is not None and self.digest != digest_of(_finite(self.plain()))
+        if self.digest is None:
+            return False
+        return self.digest != digest_of(_finite(self.plain()))
 
 
 def from_plain(plain: Any) -> RunRecord:
@@ -232,8 +236,10 @@ def from_plain(plain: Any) -> RunRecord:
         ValueError: it does not fit the types of ``RunRecord`` and the settings that tables read.
     """
     record = msgspec.convert(plain, RunRecord)
-    if unknown := plain.keys() - {one.name for one in fields(RunRecord)}:
-        raise ValueError(f"unknown: {', '.join(sorted(unknown))}")
+    known = {declared.name for declared in fields(RunRecord)}
+    unknown = sorted(plain.keys() - known)
+    if unknown:
+        raise ValueError(f"unknown: {', '.join(unknown)}")
     msgspec.convert(record.config, Configuration)
     msgspec.convert(record.metrics, dict[str, float | None])
     for name, values in record.metric_info.items():
@@ -251,7 +257,8 @@ def write(folder: Path, record: RunRecord) -> Path:
     plain["digest"] = digest_of(plain)
     path = folder / FILE
     with atomic_write(path) as temporary:
-        temporary.write_text(json.dumps(plain, indent=1, allow_nan=False) + "\n")
+        text = json.dumps(plain, indent=1, allow_nan=False)
+        temporary.write_text(text + "\n")
     return path
 
 
@@ -259,7 +266,8 @@ def write_many(path: Path, records: Iterable[RunRecord]) -> None:
     """Write records to one file, one a line; their folders become relative to its own."""
     with atomic_write(path) as temporary, temporary.open("w") as file:
         for record in records:
-            folder = Path(os.path.relpath(record.folder, path.parent)).as_posix()
+            relative = os.path.relpath(record.folder, path.parent)
+            folder = Path(relative).as_posix()
             plain = _finite(replace(record, folder=folder).plain())
             file.write(json.dumps(plain, allow_nan=False) + "\n")
 
@@ -291,7 +299,8 @@ def from_json(text: str, place: str) -> RunRecord:
         _check_extent(plain, MAX_DEPTH)
         return from_plain(plain)
     except (ValueError, RecursionError) as error:
-        reason = printable(str(error).splitlines()[0][:200])
+        first_line = str(error).splitlines()[0]
+        reason = printable(first_line[:200])
         raise UserError(f"{place}: not a run record: {reason}") from None
 
 
@@ -301,9 +310,13 @@ def _check_extent(plain: Any, deepest: int) -> None:
         raise ValueError(f"nested more than {MAX_DEPTH} levels deep")
     if isinstance(plain, int) and abs(plain) > sys.float_info.max:
         raise ValueError("Number out of range")
-    if isinstance(plain, dict | list):
-        for item in plain.values() if isinstance(plain, dict) else plain:
-            _check_extent(item, deepest - 1)
+    items: Iterable[Any] = ()
+    if isinstance(plain, dict):
+        items = plain.values()
+    if isinstance(plain, list):
+        items = plain
+    for item in items:
+        _check_extent(item, deepest - 1)
 
 
 def _finite(plain: dict[str, Any]) -> dict[str, Any]:
@@ -315,9 +328,11 @@ def environment() -> dict[str, Any]:
     """Return versions, machine and the commit of the code, as plain data."""
     import torch
 
+    versions = {"python": platform.python_version()}
+    for name in PACKAGES:
+        versions[name] = version(name)
     return {
-        "versions": {"python": platform.python_version()}
-        | {name: version(name) for name in PACKAGES},
+        "versions": versions,
         "platform": f"{platform.system()} {platform.machine()}",
         "threads": torch.get_num_threads(),
         "git": git_state(),
@@ -343,4 +358,5 @@ def git_state() -> dict[str, Any]:
 
 def _git(top: Path, *arguments: str) -> str:
     command = ["git", "-C", str(top), *arguments]
-    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+    finished = subprocess.run(command, check=True, capture_output=True, text=True)
+    return finished.stdout.strip()

@@ -1,5 +1,6 @@
 """The end of a run's output: a table of its test results and the paths of its files."""
 
+from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,13 +45,16 @@ def closing_lines(folder: Path, record: RunRecord, console: Console | None = Non
         title, table = results_table(record)
         console.print(title, soft_wrap=True, highlight=False, style="italic")
         console.print(table)
-        for line in filter(None, (collapse_line(record), advice(record))):
-            console.print(line, soft_wrap=True, highlight=False)
-    status = f"{record.status} in {record.seconds['total']:.0f} s"
+        for line in (collapse_line(record), advice(record)):
+            if line:
+                console.print(line, soft_wrap=True, highlight=False)
+    seconds = record.seconds["total"]
+    status = f"{record.status} in {seconds:.0f} s"
     if record.partial:
         status += f", but {' and '.join(record.partial)}"
     files = ", ".join([FILE, *sorted(record.files.values())])
-    console.print(f"{status}; files in {folder}/: {files}", soft_wrap=True, highlight=False)
+    line = f"{status}; files in {folder}/: {files}"
+    console.print(line, soft_wrap=True, highlight=False)
 
 
 def advice(record: RunRecord) -> str:
@@ -64,7 +68,7 @@ def advice(record: RunRecord) -> str:
     is_asked = names["dataset"] == "clouds" or names["task"] == "registration"
     if not is_asked or score is None:
         return ""
-    scores: dict[int, dict[str, list[float]]] = {}
+    scores: dict[int, dict[str, list[float]]] = defaultdict(dict)
     for key, value in record.metrics.items():
         name = parse_metric_name(key)
         if name is None or name.metric != score.metric or value is None:
@@ -72,10 +76,11 @@ def advice(record: RunRecord) -> str:
         is_baseline = name.readout not in ROWS
         if is_baseline or name.readout == COMPLETED:
             m = name.m or record.config["m"]
-            scores.setdefault(m, {})[name.readout] = [value]
+            scores[m][name.readout] = [value]
     if not all(COMPLETED in values for values in scores.values()):
         return ""
-    return verdict(scores, metric_info(score.metric, [record]), [COMPLETED])
+    info = metric_info(score.metric, [record])
+    return verdict(scores, info, [COMPLETED])
 
 
 @dataclass(frozen=True)
@@ -105,7 +110,10 @@ class _Results:
         texts = []
         for column, metric in self.columns.items():
             value = self.rows[readout].get(column)
-            texts.append("" if value is None else metric.format(value))
+            text = ""
+            if value is not None:
+                text = metric.format(value)
+            texts.append(text)
         return texts
 
 
@@ -133,15 +141,20 @@ def results_table(record: RunRecord) -> tuple[str, Table]:
         if not any(cells):  # it has metrics of the sampled set only
             continue
         if own_column and readout in (GENERATED, MATCHED):
-            cells.append(f"{collapsed(record)[config['m']]:.1f}")
+            count = collapsed(record)[config["m"]]
+            cells.append(f"{count:.1f}")
         table.add_row(_label(readout, config), *cells)
     if has_collapsed and results.by_size:
         counts = distinct_points(record)
-        table.add_row(DISTINCT, *(f"{counts[size]:.1f}" for size in results.columns))
+        cells = [f"{counts[size]:.1f}" for size in results.columns]
+        table.add_row(DISTINCT, *cells)
     names = shown_names(config)
-    title = f"{names['task']} by {names['net']}, {names['dataset']}, {results.what}, test"
-    changed = [f"{name}={config[name]}" for name in OF_TEST_CLOUDS if config.get(name)]
-    return ", ".join([title, *changed]), table
+    task = f"{names['task']} by {names['net']}"
+    parts = [task, names["dataset"], results.what, "test"]
+    for name in OF_TEST_CLOUDS:
+        if config.get(name):
+            parts.append(f"{name}={config[name]}")
+    return ", ".join(parts), table
 
 
 def _by_size(record: RunRecord, metric: str) -> _Results:
@@ -171,16 +184,20 @@ def _by_metric(record: RunRecord) -> _Results:
         if name is not None:
             rows.setdefault(name.readout, {})[name.metric] = value
     # Metrics of the task only: a full cloud has no metrics of the sampled set.
-    infos = in_summary_order(metric_info(name, [record]) for name in rows.get(FULL, {}))
-    columns = {info.name: info for info in infos}
+    metrics = [metric_info(name, [record]) for name in rows.get(FULL, {})]
+    columns = {info.name: info for info in in_summary_order(metrics)}
+    what = f"m={record.config['m']}"
     is_task_alone = record.config.get("learn") == "task"
-    what = "all points" if is_task_alone else f"m={record.config['m']}"
+    if is_task_alone:
+        what = "all points"
     return _Results(what, columns, rows, by_size=False)
 
 
 def _row_key(readout: str) -> int:
     """Return a key that sorts readouts as tables do, baselines first."""
-    return ROWS.index(readout) if readout in ROWS else -1
+    if readout not in ROWS:
+        return -1
+    return ROWS.index(readout)
 
 
 def shown_names(config: dict[str, Any]) -> Names:
@@ -198,7 +215,8 @@ def shown_names(config: dict[str, Any]) -> Names:
     names: Any = dict(config["names"])
     for group, node in nodes.items():
         if node and names[group] == OWN and node.get("_target_"):
-            names[group] = str(node["_target_"]).rpartition(".")[2]
+            target = str(node["_target_"])
+            names[group] = target.rpartition(".")[2]
     return names
 
 
@@ -219,8 +237,10 @@ def baseline_name(config: dict[str, Any], name: str) -> str:
 
     Two baselines need two names: ``fps`` and ``fps_farthest``, which is ``fps from farthest``.
     """
-    node = (config.get("baselines") or {}).get(name) or {}
-    return name.removesuffix(f"_{node.get('start')}") + _start(node)
+    baselines = config.get("baselines") or {}
+    node = baselines.get(name) or {}
+    suffix = f"_{node.get('start')}"
+    return name.removesuffix(suffix) + _start(node)
 
 
 def _start(sampler: dict[str, Any]) -> str:
@@ -228,12 +248,15 @@ def _start(sampler: dict[str, Any]) -> str:
     start = sampler.get("start")
     if start is None:
         return ""
-    return f" from {start}" if isinstance(start, str) else f" from row {start}"
+    if isinstance(start, str):
+        return f" from {start}"
+    return f" from row {start}"
 
 
 def _label(readout: str, config: dict[str, Any]) -> str:
     """Return the label of a readout's row."""
     if readout == FULL:
         return "all points"
-    own = f"{sampler_name(config)} {readout}"
-    return own if readout in ROWS else baseline_name(config, readout)
+    if readout in ROWS:
+        return f"{sampler_name(config)} {readout}"
+    return baseline_name(config, readout)

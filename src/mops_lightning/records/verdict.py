@@ -16,7 +16,19 @@ FPS = {
 LEVEL = 0.01
 """Relative difference that counts as the spread of a single draw; of percentages, one point."""
 
-WORDS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
+WORDS = (
+    "no",
+    "one",
+    "two",
+    "three",
+    "four",
+    "five",
+    "six",
+    "seven",
+    "eight",
+    "nine",
+    "ten",
+)
 
 Draws = Sequence[float]
 """The values of one method, one for each draw; all methods see the same draws."""
@@ -43,7 +55,11 @@ class Gain:
 
     @classmethod
     def of(
-        cls, values: Draws, rival: Draws, metric: MetricInfo, draws: int | None = None
+        cls,
+        values: Draws,
+        rival: Draws,
+        metric: MetricInfo,
+        draws: int | None = None,
     ) -> "Gain":
         """Compare two methods.
 
@@ -53,21 +69,26 @@ class Gain:
             metric: says which direction is better.
             draws: number of draws, if each gave several values, which may depend on each other.
         """
-        sign = 1.0 if metric.higher_is_better else -1.0
-        differences = [sign * (a - b) for a, b in zip(values, rival, strict=True)]
+        sign = -1.0
+        if metric.higher_is_better:
+            sign = 1.0
+        pairs = zip(values, rival, strict=True)
+        differences = [sign * (value - other) for value, other in pairs]
         level = 100 * LEVEL
         if metric.unit == "%":
             unit = "percentage points"
             differences = [metric.scale * difference for difference in differences]
         elif min(rival) > 0:
             unit = "%"
-            differences = [100 * d / b for d, b in zip(differences, rival, strict=True)]
+            shares = zip(differences, rival, strict=True)
+            differences = [100 * difference / other for difference, other in shares]
         else:
             unit = ""
             level = LEVEL
         spread = level
         if len(differences) > 1:
-            spread = 2 * stdev(differences) / sqrt(draws or len(differences))
+            number = draws or len(differences)
+            spread = 2 * stdev(differences) / sqrt(number)
         return cls(fmean(differences), spread, unit)
 
     @property
@@ -78,7 +99,9 @@ class Gain:
     def __str__(self) -> str:
         """Return the absolute value with its unit."""
         size = abs(self.mean)
-        number = f"{size:.2g}" if size < 10 else f"{size:.0f}"
+        number = f"{size:.0f}"
+        if size < 10:
+            number = f"{size:.2g}"
         return f"{number} {self.unit}".rstrip()
 
 
@@ -101,7 +124,9 @@ class Advice:
 def better_fps(values: Mapping[str, Draws], metric: MetricInfo) -> str:
     """Return the form of farthest point sampling with the better mean."""
     forms = [name for name in FPS if name in values]
-    sign = -1.0 if metric.higher_is_better else 1.0
+    sign = 1.0
+    if metric.higher_is_better:
+        sign = -1.0
     return min(forms, key=lambda name: sign * fmean(values[name]))
 
 
@@ -136,7 +161,10 @@ def advise(
 
 
 def verdict(
-    scores: Scores, metric: MetricInfo, own: Sequence[str] = (), parts: Scores | None = None
+    scores: Scores,
+    metric: MetricInfo,
+    own: Sequence[str] = (),
+    parts: Scores | None = None,
 ) -> str:
     """Return the sentence.
 
@@ -154,18 +182,41 @@ def verdict(
     draws = 0
     for m in sorted(scores):
         values = scores[m]
-        if any(name in values for name in FPS) and set(values) - set(FPS):
-            advice.append(advise(m, values, metric, None if parts is None else parts[m]))
+        has_fps = any(name in values for name in FPS)
+        has_others = bool(set(values) - set(FPS))
+        if has_fps and has_others:
+            parts_of_size = None
+            if parts is not None:
+                parts_of_size = parts[m]
+            advice.append(advise(m, values, metric, parts_of_size))
             draws = len(next(iter(values.values())))
     if not advice:
         return ""
-    called = {name: name for one in advice for name in one.gains} | FPS
-    if len(own) == 1:
-        called[own[0]] = "your sampler"
+    called = _names_of_methods(advice, own)
     clauses = [_lead(advice, called), *_wins(advice, called, own)]
     clauses += _losses(advice, called, own)
-    number = WORDS[draws] if draws < len(WORDS) else str(draws)
-    return f"{'; '.join(clauses)} ({number} {'draw' if draws == 1 else 'draws'})."
+    return f"{'; '.join(clauses)} ({_number_of_draws(draws)})."
+
+
+def _names_of_methods(advice: Sequence[Advice], own: Sequence[str]) -> dict[str, str]:
+    """Return what the sentence calls each method."""
+    called = {}
+    for of_size in advice:
+        for name in of_size.gains:
+            called[name] = name
+    called |= FPS
+    if len(own) == 1:
+        called[own[0]] = "your sampler"
+    return called
+
+
+def _number_of_draws(draws: int) -> str:
+    number = str(draws)
+    if draws < len(WORDS):
+        number = WORDS[draws]
+    if draws == 1:
+        return f"{number} draw"
+    return f"{number} draws"
 
 
 def _lead(advice: Sequence[Advice], called: Mapping[str, str]) -> str:
@@ -175,15 +226,17 @@ def _lead(advice: Sequence[Advice], called: Mapping[str, str]) -> str:
     start = len(advice) - 1
     while start and _is_same(advice[start - 1].method, last):
         start -= 1
-    forms = {one.method for one in advice[start:]}
+    forms = {of_size.method for of_size in advice[start:]}
     name = called[last]
     if is_fps and len(forms) > 1:
         name = "FPS"
     if start:
         return f"Use {name} from {advice[start].m:,} points on"
+    smallest = advice[0].m
     if len(advice) == 1:
-        return f"Use {name} for {advice[0].m:,} points"
-    return f"Use {name} for {advice[0].m:,} to {advice[-1].m:,} points"
+        return f"Use {name} for {smallest:,} points"
+    largest = advice[-1].m
+    return f"Use {name} for {smallest:,} to {largest:,} points"
 
 
 def _is_same(method: str, other: str) -> bool:
@@ -193,10 +246,12 @@ def _is_same(method: str, other: str) -> bool:
 def _wins(advice: Sequence[Advice], called: Mapping[str, str], own: Sequence[str]) -> list[str]:
     """Return a clause for every method that is best somewhere."""
     clauses = []
-    winners = dict.fromkeys(one.method for one in advice if one.method not in FPS)
+    methods = [of_size.method for of_size in advice]
+    winners = dict.fromkeys(method for method in methods if method not in FPS)
     # A user's own sampler first.
     for name in sorted(winners, key=lambda name: name not in own):
-        parts = [_win(one, own, called) for one in advice if one.method == name]
+        wins = [of_size for of_size in advice if of_size.method == name]
+        parts = [_win(of_size, own, called) for of_size in wins]
         parts[0] = parts[0].replace(" at ", " better at ", 1)
         clauses.append(f"{called[name]} is {_joined(parts)}")
     if clauses and advice[-1].method not in FPS:
@@ -204,18 +259,23 @@ def _wins(advice: Sequence[Advice], called: Mapping[str, str], own: Sequence[str
     return clauses
 
 
-def _win(one: Advice, own: Sequence[str], called: Mapping[str, str]) -> str:
-    text = f"{one.gains[one.method]} at {one.m:,}"
-    seconds = [name for name in own if name in one.gains and one.gains[name].is_sure]
-    if one.method not in own and seconds:
-        best = max(seconds, key=lambda name: one.gains[name].mean)
-        text += f" ({called[best]}: {one.gains[best]})"
+def _win(of_size: Advice, own: Sequence[str], called: Mapping[str, str]) -> str:
+    gains = of_size.gains
+    text = f"{gains[of_size.method]} at {of_size.m:,}"
+    seconds = [name for name in own if name in gains and gains[name].is_sure]
+    if of_size.method not in own and seconds:
+        best = max(seconds, key=lambda name: gains[name].mean)
+        text += f" ({called[best]}: {gains[best]})"
     return text
 
 
 def _losses(advice: Sequence[Advice], called: Mapping[str, str], own: Sequence[str]) -> list[str]:
     """Return a clause about the user's best sampler if it is nowhere better than FPS."""
-    gains = [(one.gains[name], one.m, name) for one in advice for name in own if name in one.gains]
+    gains = []
+    for of_size in advice:
+        for name in own:
+            if name in of_size.gains:
+                gains.append((of_size.gains[name], of_size.m, name))
     if not gains or any(gain.is_sure for gain, _, _ in gains):
         return []
     gain, m, name = max(gains, key=lambda entry: entry[0].mean)
@@ -230,4 +290,5 @@ def _joined(parts: Sequence[str]) -> str:
     """Return parts as ``a, b and c``."""
     if len(parts) == 1:
         return parts[0]
-    return f"{', '.join(parts[:-1])} and {parts[-1]}"
+    *others, last = parts
+    return f"{', '.join(others)} and {last}"

@@ -55,10 +55,12 @@ class Task(nn.Module):
             raise UserError(f"net must be a torch.nn.Module, got {net!r}.")
         takes = tuple(signature(net.forward).parameters)
         if takes != self.net_takes:
+            needed = ", ".join(self.net_takes)
+            given = ", ".join(takes)
             raise UserError(
-                f"net must take ({', '.join(self.net_takes)}), as "
+                f"net must take ({needed}), as "
                 f"{type(self).__name__.lower()} needs it; got {type(net).__name__}, which takes "
-                f"({', '.join(takes)}). Choose a net of this task."
+                f"({given}). Choose a net of this task."
             )
         self.net = net
 
@@ -124,7 +126,10 @@ class Task(nn.Module):
 
 @singledispatch
 def figures_of(
-    task: Task, batch: Any, samples: Mapping[str, Tensor], titles: Sequence[str]
+    task: Task,
+    batch: Any,
+    samples: Mapping[str, Tensor],
+    titles: Sequence[str],
 ) -> "dict[str, Figure]":
     """Draw a task's results for a few clouds, by name; nothing unless a task registers a function.
 

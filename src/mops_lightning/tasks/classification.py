@@ -14,7 +14,8 @@ from mops_lightning.types import Batch, TaskOutput
 def divergence(found: Tensor, reference: Tensor) -> Tensor:
     """Return KL(reference ‖ found) over the last dimension of logits ``(..., C)``: ``(...)``."""
     expected = reference.log_softmax(-1)
-    return (expected.exp() * (expected - found.log_softmax(-1))).sum(-1)
+    difference = expected - found.log_softmax(-1)
+    return (expected.exp() * difference).sum(-1)
 
 
 class Classification(Task):
@@ -71,4 +72,5 @@ class Classification(Task):
 
     def metrics(self, training: bool = False) -> MetricCollection:
         """Return overall and mean class accuracy, both in [0, 1]."""
-        return collection(Accuracy(self.num_classes), MeanClassAccuracy(self.num_classes))
+        accuracy = Accuracy(self.num_classes)
+        return collection(accuracy, MeanClassAccuracy(self.num_classes))

@@ -77,14 +77,20 @@ class Reconstruction(Task):
     def scores(self, batch: Batch, samples: Mapping[K, Tensor]) -> dict[K, TaskOutput]:
         """Return the distances of reconstructions from samples and, as targets, from all points."""
         clouds = coordinates(batch.points)
-        block = None if clouds.shape[1] <= (self.exact_up_to or 0) else SCORED_BLOCK
+        block = None
+        if clouds.shape[1] > (self.exact_up_to or 0):
+            block = SCORED_BLOCK
 
         def scored(points: Tensor) -> reconstruction.Distances:
-            return self._distances(self.predict(batch, points), clouds, block, SCORED_ROUNDS)
+            built = self.predict(batch, points)
+            return self._distances(built, clouds, block, SCORED_ROUNDS)
 
         full = scored(batch.points)
-        found = {name: scored(points) for name, points in samples.items()}
-        return {name: TaskOutput(_means(one), one, full) for name, one in found.items()}
+        outputs = {}
+        for name, points in samples.items():
+            found = scored(points)
+            outputs[name] = TaskOutput(_means(found), found, full)
+        return outputs
 
     def _distances(
         self, built: Tensor, clouds: Tensor, block: int | None, rounds: int
@@ -106,18 +112,26 @@ class Reconstruction(Task):
         if self.exact_up_to is not None:
             metrics.append(reconstruction.MeanEMD())
             if not training:
-                metrics += [reconstruction.NormalizedEMD(), reconstruction.NormalizedEMDOfMeans()]
+                metrics.append(reconstruction.NormalizedEMD())
+                metrics.append(reconstruction.NormalizedEMDOfMeans())
         return collection(*metrics)
 
 
 def _means(distances: reconstruction.Distances) -> dict[str, Tensor]:
     """Return the loss terms: means over the clouds, by the name of the distance."""
-    return {k: v.mean() for k, v in distances._asdict().items() if v is not None}
+    means = {}
+    for name, values in distances._asdict().items():
+        if values is not None:
+            means[name] = values.mean()
+    return means
 
 
 @figures_of.register(Reconstruction)
 def _(
-    task: Reconstruction, batch: Batch, samples: Mapping[str, Tensor], titles: Sequence[str]
+    task: Reconstruction,
+    batch: Batch,
+    samples: Mapping[str, Tensor],
+    titles: Sequence[str],
 ) -> "dict[str, Figure]":
     """Draw input, sampled points and reconstructions side by side."""
     from mops_lightning.viz.task_results import ReconstructionResult, reconstruction_grid
@@ -130,6 +144,7 @@ def _(
         if chosen.shape == batch.points.shape:
             continue  # all points have a column of their own
         built = task.predict(batch, chosen)
-        ratios = (chamfer_distance(built, clouds) / reference).tolist()
+        distances = chamfer_distance(built, clouds)
+        ratios = (distances / reference).tolist()
         columns[name] = ReconstructionResult(coordinates(chosen), built, ratios)
     return {"reconstructions": reconstruction_grid(clouds, full, columns, titles)}

@@ -99,18 +99,26 @@ class Registration(Task):
                 "(task.resample and dataset.n_points on the command line)."
             )
         motion = random_motion(ROTATION, TRANSLATION, generators)
-        source = target = points
+        source = points
+        target = points
         if self.resample is not None:
-            source, target = (self._drawn(points, generators) for _ in range(2))
-        return pair_batch(source, move(target, motion, self.point_channels), motion)
+            source = self._drawn(points, generators)
+            target = self._drawn(points, generators)
+        moved = move(target, motion, self.point_channels)
+        return pair_batch(source, moved, motion)
 
     def _drawn(self, points: Tensor, generators: Sequence[Generator]) -> Tensor:
-        rows = [torch.randperm(points.shape[1], generator=g)[: self.resample] for g in generators]
+        number = points.shape[1]
+        rows = []
+        for generator in generators:
+            order = torch.randperm(number, generator=generator)
+            rows.append(order[: self.resample])
         return gather_points(points, torch.stack(rows))
 
     def predict(self, batch: PairBatch, points: Tensor) -> Motion:
         """Return the motions between the centred clouds from ``(2B, M, 3)`` points of both."""
-        return self.net(*points.chunk(2))
+        source, target = points.chunk(2)
+        return self.net(source, target)
 
     def disagreement(self, found: Motion, reference: Motion) -> Tensor:
         """Return the squared distance of two motions.
@@ -121,7 +129,8 @@ class Registration(Task):
         rotation = quaternion_to_matrix(found.quaternion)
         rotation = rotation - quaternion_to_matrix(reference.quaternion)
         translation = found.translation - reference.translation
-        return rotation.square().sum((1, 2)) + translation.square().sum(1)
+        of_rotation = rotation.square().sum((1, 2))
+        return of_rotation + translation.square().sum(1)
 
     def step(self, batch: PairBatch, points: Tensor) -> TaskOutput:
         """Register one batch.
@@ -137,9 +146,11 @@ class Registration(Task):
         true = Motion(batch.quaternion, batch.translation)
         from_source, from_target = batch.centroids.chunk(2)
         # The true motion between the centred clouds: R·(p + c) + t = R·p + (R·c + t).
-        shift = true.apply(from_source[:, None])[:, 0] - from_target
+        moved_centre = true.apply(from_source[:, None])[:, 0]
+        shift = moved_centre - from_target
         losses = quaternion_loss(found, true._replace(translation=shift))
-        turned = found._replace(translation=from_target).apply(-from_source[:, None])[:, 0]
+        about_target = found._replace(translation=from_target)
+        turned = about_target.apply(-from_source[:, None])[:, 0]
         predicted = Motion(found.quaternion, found.translation + turned)
         return TaskOutput(losses, predicted, true, found)
 
@@ -168,8 +179,10 @@ def quaternion_distance(predicted: Tensor, true: Tensor) -> Tensor:
     Returns:
         A scalar, the mean over the batch.
     """
-    sign = torch.where((predicted * true).sum(1, keepdim=True) < 0, -1.0, 1.0)
-    return torch.linalg.vector_norm(predicted - sign * true, dim=1).mean()
+    products = (predicted * true).sum(1, keepdim=True)
+    sign = torch.where(products < 0, -1.0, 1.0)
+    distances = torch.linalg.vector_norm(predicted - sign * true, dim=1)
+    return distances.mean()
 
 
 def quaternion_loss(predicted: Motion, true: Motion) -> dict[str, Tensor]:
@@ -185,7 +198,8 @@ def quaternion_loss(predicted: Motion, true: Motion) -> dict[str, Tensor]:
         The terms ``quaternion`` and ``translation``, scalars. The paper does not mention the L2
         distance between translations, but without it they would not be trained.
     """
-    shift = torch.linalg.vector_norm(predicted.translation - true.translation, dim=1).mean()
+    difference = predicted.translation - true.translation
+    shift = torch.linalg.vector_norm(difference, dim=1).mean()
     return {
         "quaternion": quaternion_distance(predicted.quaternion, true.quaternion),
         "translation": shift,
@@ -194,7 +208,10 @@ def quaternion_loss(predicted: Motion, true: Motion) -> dict[str, Tensor]:
 
 @figures_of.register(Registration)
 def _(
-    task: Registration, batch: PairBatch, samples: Mapping[str, Tensor], titles: Sequence[str]
+    task: Registration,
+    batch: PairBatch,
+    samples: Mapping[str, Tensor],
+    titles: Sequence[str],
 ) -> "dict[str, Figure]":
     """Draw the pairs before and after alignment, one column for each readout."""
     from mops_lightning.viz.task_results import RegistrationResult, pair_grid
@@ -207,7 +224,10 @@ def _(
         of_source, of_target = coordinates(points).chunk(2)
         errors = RotationError.of(result.predictions, result.targets)
         columns[name] = RegistrationResult(
-            motion.apply(source), motion.apply(of_source), of_target, errors.tolist()
+            motion.apply(source),
+            motion.apply(of_source),
+            of_target,
+            errors.tolist(),
         )
     true = Motion(batch.quaternion, batch.translation)
     before = RotationError.of(identity_motion(source), true).tolist()

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Generator, Tensor, nn
+from torch.nn import functional as F
 from torchmetrics import MetricCollection
 
 from mops_lightning.channels import coordinates
@@ -69,25 +70,29 @@ class ScanRegistration(Registration):
         Raises:
             UserError: a cloud has fewer than two points.
         """
-        half = points.shape[1] // 2
+        number = points.shape[1]
+        half = number // 2
         if half < 1:
-            raise UserError(f"task=icp needs clouds of two points or more, got {points.shape[1]}.")
-        rows = torch.stack([torch.randperm(points.shape[1], generator=g) for g in generators])
+            raise UserError(f"task=icp needs clouds of two points or more, got {number}.")
+        orders = [torch.randperm(number, generator=generator) for generator in generators]
+        rows = torch.stack(orders)
         source = gather_points(points, rows[:, :half])
         target = gather_points(points, rows[:, half : 2 * half])
-        drawn = [torch.randn(6, generator=g) for g in generators]
-        sizes = [torch.rand(2, generator=g) for g in generators]
-        motion = self._motion(torch.stack(drawn), torch.stack(sizes))
-        both = torch.cat([source, motion.apply(coordinates(target))])
+        directions = [torch.randn(6, generator=generator) for generator in generators]
+        sizes = [torch.rand(2, generator=generator) for generator in generators]
+        motion = self._motion(torch.stack(directions), torch.stack(sizes))
+        moved = motion.apply(coordinates(target))
+        both = torch.cat([source, moved])
         still = torch.zeros(len(both), 3)
         return PairBatch(both, still, motion.quaternion, motion.translation)
 
     def _motion(self, directions: Tensor, sizes: Tensor) -> Motion:
         """Return motions from directions ``(B, 6)`` and shares ``(B, 2)`` of the largest ones."""
-        axis = torch.nn.functional.normalize(directions[:, :3], dim=1)
-        along = torch.nn.functional.normalize(directions[:, 3:], dim=1)
+        axis = F.normalize(directions[:, :3], dim=1)
+        along = F.normalize(directions[:, 3:], dim=1)
         angle = torch.deg2rad(sizes[:, :1] * self.angle)
-        return motion_of_vectors(axis * angle, along * sizes[:, 1:] * self.shift)
+        shift = along * sizes[:, 1:] * self.shift
+        return motion_of_vectors(axis * angle, shift)
 
     def predict(self, batch: PairBatch, points: Tensor) -> Motion:
         """Return the motions from sampled sources, of ``(2B, M, 3)`` points, to whole targets."""
@@ -102,7 +107,8 @@ class ScanRegistration(Registration):
             return {}
         expected = output.log_residuals
         found = self.residuals(batch)
-        losses = (found * (-expected).exp()[:, None]) + expected[:, None]
+        precision = (-expected).exp()
+        losses = found * precision[:, None] + expected[:, None]
         return {"residual": losses.mean()}
 
     @torch.no_grad()
@@ -113,7 +119,8 @@ class ScanRegistration(Registration):
         generator.
         """
         source, target = coordinates(batch.points).chunk(2)
-        aligned = Motion(batch.quaternion, batch.translation).apply(source)
+        true = Motion(batch.quaternion, batch.translation)
+        aligned = true.apply(source)
         clouds = torch.cat([aligned, target])
         others = torch.cat([target, aligned])
         normals = surface_normals(others)
@@ -121,16 +128,18 @@ class ScanRegistration(Registration):
         for number in range(MOTIONS):
             share = number / (MOTIONS - 1)
             sizes = share * torch.rand(len(clouds), 2)
-            motion = self._motion(torch.randn(len(clouds), 6), sizes)
+            directions = torch.randn(len(clouds), 6)
+            motion = self._motion(directions, sizes)
             residuals.append(self._residuals(clouds, motion, others, normals))
         return torch.stack(residuals, 1)
 
     def _residuals(self, clouds: Tensor, motion: Motion, others: Tensor, normals: Tensor) -> Tensor:
         """Return the residuals ``(B, N)`` for the correspondences after one motion."""
         rows, distance = nearest_rows(motion.apply(clouds), others)
-        apart = (clouds - gather_points(others, rows)) * gather_points(normals, rows)
+        apart = clouds - gather_points(others, rows)
+        across = (apart * gather_points(normals, rows)).sum(2)
         is_near = distance <= self.max_distance
-        return apart.sum(2).abs().where(is_near, self.max_distance)
+        return across.abs().where(is_near, self.max_distance)
 
     def metrics(self, training: bool = False) -> MetricCollection:
         """Return rotation errors in degrees, the share below 2° and the translation error."""

@@ -50,7 +50,8 @@ class Segmentation(Task):
         logits = self.net(points)
         if points is batch.points:  # every point is its own nearest one
             return logits
-        return interpolate(logits, coordinates(points), coordinates(batch.points), self.k)
+        places = coordinates(points)
+        return interpolate(logits, places, coordinates(batch.points), self.k)
 
     def disagreement(self, found: Tensor, reference: Tensor) -> Tensor:
         """Return KL(reference ‖ found), the mean over the points of a cloud."""
@@ -75,24 +76,30 @@ class Segmentation(Task):
         logits = self.predict(batch, points)
         # The mean of F.cross_entropy would be 0/0 for a batch without a known part.
         total = F.cross_entropy(logits.mT, batch.parts, ignore_index=UNKNOWN, reduction="sum")
-        losses = {"cross_entropy": total / (batch.parts != UNKNOWN).sum().clamp(min=1)}
+        number_known = (batch.parts != UNKNOWN).sum()
+        losses = {"cross_entropy": total / number_known.clamp(min=1)}
         losses |= getattr(self.net, "losses", {})
         return TaskOutput(losses, logits.argmax(2), batch.parts, logits)
 
     def metrics(self, training: bool = False) -> MetricCollection:
         """Return mean intersection over union of the parts and accuracy, both in [0, 1]."""
-        kinds = (MeanIoU, PointAccuracy)
-        return collection(*(kind(self.num_parts, ignore_index=UNKNOWN) for kind in kinds))
+        mean_iou = MeanIoU(self.num_parts, ignore_index=UNKNOWN)
+        return collection(mean_iou, PointAccuracy(self.num_parts, ignore_index=UNKNOWN))
 
 
 @figures_of.register(Segmentation)
 def _(
-    task: Segmentation, batch: Batch, samples: Mapping[str, Tensor], titles: Sequence[str]
+    task: Segmentation,
+    batch: Batch,
+    samples: Mapping[str, Tensor],
+    titles: Sequence[str],
 ) -> "dict[str, Figure]":
     """Draw the true parts, and those predicted from the points of every readout."""
     from mops_lightning.viz.task_results import part_grid
 
     assert batch.parts is not None
-    predicted = {name: task.step(batch, points).predictions for name, points in samples.items()}
-    parts = {"true parts": batch.parts, **predicted}
+    parts = {"true parts": batch.parts}
+    for name, points in samples.items():
+        result = task.step(batch, points)
+        parts[name] = result.predictions
     return {"parts": part_grid(coordinates(batch.points), parts, titles)}
