@@ -100,7 +100,9 @@ def _about_runs(found: collect.Found, shown: list[RunRecord], tables: list[Table
     tasks = {collect.names(record)["task"] for record in shown}
     of_tasks = [record for record in found.done if collect.names(record)["task"] in tasks]
     nets = {table.net for table in tables}
-    net = nets.pop() if len(nets) == 1 else ""
+    net = ""
+    if len(nets) == 1:
+        net = nets.pop()
     hidden: set[str] = set()
     for table in tables:
         hidden.update(table.hidden)

@@ -50,7 +50,8 @@ def main(arguments: list[str] | None = None, prog: str = "mops-lightning report"
         if chosen.records:
             run_record.write_many(chosen.records, report.found.done)
         print(markdown(report.grids, report.remarks))
-        print(f"files in {chosen.folder}/: {', '.join(written)}")
+        files = ", ".join(written)
+        print(f"files in {chosen.folder}/: {files}")
 
 
 def write(report: Report, folder: Path) -> list[str]:
@@ -64,7 +65,9 @@ def write(report: Report, folder: Path) -> list[str]:
     from mops_lightning.viz.figures import save_figure
 
     figures = plots(report)
-    pictures = [f"{name}{suffix}" for name in figures for suffix in (".png", ".svg")]
+    pictures = []
+    for name in figures:
+        pictures += [f"{name}.png", f"{name}.svg"]
     names = [TABLE, "table.tex", "table.csv", PAGE, *pictures]
     check_replaceable(folder, names)
     remove_temporary(folder, below=False)
@@ -77,7 +80,8 @@ def write(report: Report, folder: Path) -> list[str]:
         _write_text(folder / name, text)
     for name, figure in figures.items():
         for suffix in (".png", ".svg"):
-            save_figure(figure, folder / f"{name}{suffix}", dpi=150, software=MARK)
+            path = folder / f"{name}{suffix}"
+            save_figure(figure, path, dpi=150, software=MARK)
     drawn = [folder / f"{name}.svg" for name in figures]
     _write_text(folder / PAGE, page(report, folder, drawn))
     return names
@@ -85,11 +89,17 @@ def write(report: Report, folder: Path) -> list[str]:
 
 def _csv(report: Report) -> str:
     """Return every figure of every run as comma-separated values."""
-    settings = sorted({key for table in report.tables for key in table.group.settings})
-    net = report.tables[0].net if report.tables else ""
-    rows = RowNames(report.found.done, net, settings)
-    long = long_form(report.found.done, rows, settings)
-    return long.drop(columns=[*NOT_IN_CSV]).to_csv(index=False, lineterminator="\n")
+    settings: set[str] = set()
+    for table in report.tables:
+        settings.update(table.group.settings)
+    net = ""
+    if report.tables:
+        net = report.tables[0].net
+    found = report.found.done
+    rows = RowNames(found, net, sorted(settings))
+    long = long_form(found, rows, sorted(settings))
+    shown = long.drop(columns=[*NOT_IN_CSV])
+    return shown.to_csv(index=False, lineterminator="\n")
 
 
 def _write_text(path: Path, text: str) -> None:

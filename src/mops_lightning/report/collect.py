@@ -59,7 +59,9 @@ def collect(folder: Path) -> Found:
 def _why_undone(record: RunRecord) -> str:
     """Return the status of a run without a full result, with the reasons if it tells them."""
     reasons = " and ".join(record.partial) or record.error
-    return f"{record.status}: {reasons}" if reasons else record.status
+    if not reasons:
+        return record.status
+    return f"{record.status}: {reasons}"
 
 
 def _records(folder: Path) -> list[tuple[Path, RunRecord | str]]:
@@ -74,7 +76,8 @@ def _records(folder: Path) -> list[tuple[Path, RunRecord | str]]:
             except UserError as error:
                 records[Path(place)] = str(error)
     paths = [*folder.rglob(run_record.FILE), *folder.rglob(FAILED)]
-    for run in {path.parent for path in paths if ASIDE not in path.parts}:
+    runs = {path.parent for path in paths if ASIDE not in path.parts}
+    for run in runs:
         try:
             records[run] = run_record.read(run)
         except UserError as error:
@@ -100,7 +103,9 @@ def trained_with(record: RunRecord) -> str:
     learn = record.config["learn"]
     if record.evaluated:
         learn = record.evaluated.learn
-    return "joint" if learn == "joint" else "sampler alone"
+    if learn == "joint":
+        return "joint"
+    return "sampler alone"
 
 
 def recorded_recipe(record: RunRecord) -> dict[str, Any]:
@@ -146,12 +151,16 @@ def epochs(record: RunRecord) -> int | None:
     """Return the epochs that a run, or the run that it evaluates, was trained; None: untrained."""
     if "fit" in record.seconds:
         return record.config["trainer"]["max_epochs"]
-    return record.evaluated.max_epochs if record.evaluated else None
+    if record.evaluated is None:
+        return None
+    return record.evaluated.max_epochs
 
 
 def seed(record: RunRecord) -> int:
     """Return the seed of a run, or of the run that it evaluates."""
-    return record.evaluated.seed if record.evaluated else record.seed
+    if record.evaluated is None:
+        return record.seed
+    return record.evaluated.seed
 
 
 def tested_metrics(found: list[RunRecord]) -> set[str]:

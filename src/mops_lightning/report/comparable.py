@@ -1,6 +1,7 @@
 """Which runs one table may show: groups of comparable records, and the layout of their tables."""
 
 import json
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -83,12 +84,14 @@ def groups(found: list[RunRecord], mixed: bool = False) -> list[Group]:
 
 def _tests_several_nets(group: Group) -> bool:
     """Return whether all runs test samplers again, under several trained nets."""
-    if group.joint or not all(record.evaluated for record in group.records):
+    are_evaluated = all(record.evaluated for record in group.records)
+    if group.joint or not are_evaluated:
         return False
     nets = set()
     for record in group.records:
         if not weightless(record):
-            nets.add((collect.names(record)["net"], record.task_weights_sha256))
+            net = collect.names(record)["net"]
+            nets.add((net, record.task_weights_sha256))
     return len(nets) > 1
 
 
@@ -103,10 +106,14 @@ def net_groups(found: list[RunRecord], mixed: bool = False) -> list[Group]:
     result = []
     for group in _split(by_task, "commit", _commit):
         # A net's settings give it a row of its own.
-        keys = [key for key in varying(group.records) if not key.startswith(IN_ROWS_OF_NETS)]
+        keys = [key for key in varying(group.records) if not _is_in_row_of_net(key)]
         rows = [_row(record) for record in group.records]
         result += _by_settings(group, dict.fromkeys(rows, keys))
     return result
+
+
+def _is_in_row_of_net(key: str) -> bool:
+    return key.startswith(IN_ROWS_OF_NETS)
 
 
 def _split(found: list[Group], what: str, key: Key) -> list[Group]:
@@ -119,19 +126,21 @@ def _split(found: list[Group], what: str, key: Key) -> list[Group]:
     """
     result = []
     for group in found:
-        by_key: dict[tuple[str, ...], list[RunRecord]] = {}
+        by_key: dict[tuple[str, ...], list[RunRecord]] = defaultdict(list)
         shared = []
         for record in group.records:
             texts = key(record)
             if texts is None:
                 shared.append(record)
             else:
-                by_key.setdefault(texts, []).append(record)
+                by_key[texts].append(record)
         if not by_key:
             result.append(group)
         for texts, records in by_key.items():
-            about = _about(group, what, _differing(texts, list(by_key)))
-            result.append(replace(group, records=[*records, *shared], about=about))
+            differing = _differing(texts, list(by_key))
+            about = _about(group, what, differing)
+            part = replace(group, records=[*records, *shared], about=about)
+            result.append(part)
     return result
 
 
@@ -148,8 +157,13 @@ def _about(group: Group, what: str, differing: list[str]) -> str:
     """Return how a part of a group differs from the other groups."""
     if not differing:
         return group.about
-    about = " ".join(text for text in (what, *differing) if text)
-    return f"{group.about}; {about}" if group.about else about
+    words = differing
+    if what:
+        words = [what, *differing]
+    about = " ".join(word for word in words if word)
+    if group.about:
+        return f"{group.about}; {about}"
+    return about
 
 
 def _by_content(found: list[Group], what: str, name: str) -> list[Group]:
@@ -162,7 +176,9 @@ def _by_content(found: list[Group], what: str, name: str) -> list[Group]:
 
     def start_of_digest(record: RunRecord) -> tuple[str, ...] | None:
         digest = getattr(record, name)
-        return (digest[:12],) if digest else None
+        if not digest:
+            return None
+        return (digest[:12],)
 
     result = []
     for group in found:
@@ -198,9 +214,9 @@ def _with_layout(group: Group, mixed: bool) -> list[Group]:
     other setting, columns are its values; if in two, each sampler gets a heat map. A group that
     differs in more is split, unless ``mixed``.
     """
-    rows: dict[Row, list[RunRecord]] = {}
+    rows: dict[Row, list[RunRecord]] = defaultdict(list)
     for record in group.records:
-        rows.setdefault(_row(record), []).append(record)
+        rows[_row(record)].append(record)
     different = {row: varying(records) for row, records in rows.items()}
     keys = set()
     for of_row in different.values():
@@ -210,10 +226,14 @@ def _with_layout(group: Group, mixed: bool) -> list[Group]:
     column = _column(group, keys)
     planes = _planes(rows, different)
     if column is None and planes is None:
-        return [group] if mixed else _by_settings(group, different)
+        if mixed:
+            return [group]
+        return _by_settings(group, different)
     sizes = {record.config["m"] for record in group.records}
     if len(sizes) > 1:
-        return [group] if mixed else _by_size(group)
+        if mixed:
+            return [group]
+        return _by_size(group)
     if column is not None:
         return [replace(group, column=column)]
     assert planes is not None
@@ -251,9 +271,13 @@ def _planes(
 def _by_size(group: Group) -> list[Group]:
     """Split a group by the sizes of its runs, and choose the layouts of the tables."""
     result = []
-    for part in _split([group], "m", lambda record: (str(record.config["m"]),)):
+    for part in _split([group], "m", _size):
         result += _with_layout(part, mixed=False)
     return result
+
+
+def _size(record: RunRecord) -> tuple[str, ...]:
+    return (str(record.config["m"]),)
 
 
 def _by_settings(group: Group, different: dict[Row, list[str]]) -> list[Group]:
@@ -261,18 +285,26 @@ def _by_settings(group: Group, different: dict[Row, list[str]]) -> list[Group]:
 
     def about(record: RunRecord) -> tuple[str, ...] | None:
         texts = [f"{key}={value(record, key)}" for key in different[_row(record)]]
-        return (", ".join(texts),) if texts else None
+        if not texts:
+            return None
+        return (", ".join(texts),)
 
-    return sorted(_split([group], "", about), key=lambda part: part.about)
+    parts = _split([group], "", about)
+    return sorted(parts, key=lambda part: part.about)
 
 
 def varying(found: list[RunRecord]) -> list[str]:
     """Return the dotted settings in which records of one sampler differ."""
-    values: dict[str, set[str]] = {}
     settings = [considered(record) for record in found]
-    for key in {key for of_run in settings for key in of_run}:
-        values[key] = {_text(of_run.get(key)) for of_run in settings}
-    return sorted(key for key, texts in values.items() if len(texts) > 1)
+    keys: set[str] = set()
+    for of_run in settings:
+        keys.update(of_run)
+    different = []
+    for key in keys:
+        texts = {_text(of_run.get(key)) for of_run in settings}
+        if len(texts) > 1:
+            different.append(key)
+    return sorted(different)
 
 
 def considered(record: RunRecord) -> dict[str, Any]:
@@ -327,7 +359,8 @@ def _commit(record: RunRecord) -> tuple[str, ...]:
 
 def commit(record: RunRecord) -> str:
     """Return the short commit of the code that made a record."""
-    return (record.git["commit"] or "unknown")[:10]
+    full = record.git["commit"] or "unknown"
+    return full[:10]
 
 
 def _are_numbers(found: list[RunRecord], keys: list[str]) -> bool:

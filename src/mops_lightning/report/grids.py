@@ -25,7 +25,8 @@ MAX_COLUMNS = 8
 def grids(table: Table) -> list[Grid]:
     """Return the texts of a table, with the values of full clouds."""
     if table.group.planes:
-        texts = [_plane(table, row) for row in sorted(table.planes, key=sort_key)]
+        rows = sorted(table.planes, key=sort_key)
+        texts = [_plane(table, row) for row in rows]
         texts[-1].below += _full_lines(table)
     elif table.group.column == "net":
         texts = [_by_net(table)]
@@ -33,7 +34,8 @@ def grids(table: Table) -> list[Grid]:
         texts = [_by_column(table)]
     texts[-1].below += _level_line(table)
     texts[-1].below += _unchanged_lines(table)
-    texts[-1].below += dirty_line(table.values["dirty"].any())
+    is_dirty = table.values["dirty"].any()
+    texts[-1].below += dirty_line(is_dirty)
     if table.group.about:
         for grid in texts:
             grid.title += f" ({table.group.about})"
@@ -57,11 +59,13 @@ def _unchanged_lines(table: Table) -> list[str]:
     lines = []
     for row in table.rows():
         values = table.values[table.values["row"] == row]
-        shown = values["mean"].map(table.metric.format).groupby(values["readout"])
-        if shown.nunique().max() == 1 and shown.count().min() > 1:
+        texts = values["mean"].map(table.metric.format)
+        of_readouts = texts.groupby(values["readout"])
+        different = of_readouts.nunique().max()
+        if different == 1 and of_readouts.count().min() > 1:
             lines.append(
-                f"All {shown.count().max()} cells of {row} are equal: the settings that differ "
-                "changed no figure."
+                f"All {of_readouts.count().max()} cells of {row} are equal: the settings that "
+                "differ changed no figure."
             )
     return lines
 
@@ -81,12 +85,15 @@ def _by_column(table: Table) -> Grid:
     cells = table.cells(["row"])
     columns = table.columns()
     costs = _costs(table)
-    published = _published(table) if is_by_size else {}
+    published = {}
+    if is_by_size:
+        published = _published(table)
     rows: list[list] = []
     below: list[str] = []
     for row in table.rows():
         line = [row, *cells.loc[row, columns]]
-        theirs = _paper_cells(published, _sampler_of(table, row), columns)
+        sampler = _sampler_of(table, row)
+        theirs = _paper_cells(published, sampler, columns)
         if costs:
             line.append(costs.get(row, ""))
         rows.append(line)
@@ -94,10 +101,14 @@ def _by_column(table: Table) -> Grid:
             if costs:
                 theirs.append("")
             rows.append([PAPER, *theirs])
-            below = [published["note"]] if "note" in published else []
-    head = ["sampled by", *(f"{group.column}={column}" for column in columns)]
+            below = []
+            if "note" in published:
+                below.append(published["note"])
+    head = ["sampled by"]
+    head += [f"{group.column}={column}" for column in columns]
     if costs:
-        head.append(collect.training_time(group.records)[0])
+        name_of_costs, _ = collect.training_time(group.records)
+        head.append(name_of_costs)
     title = f"Test {table.metric.title}: {table.subject}"
     if is_by_size:
         below += _full_lines(table)
@@ -132,19 +143,23 @@ def _sampler_of(table: Table, row: str) -> str:
     """Return the name of a row's sampler in the paper's tables, whose net is the table's."""
     for record in table.group.records:
         names = collect.names(record)
-        if table.row_names.of(record) == row and names["net"] == table.net:
+        is_of_row = table.row_names.of(record) == row
+        if is_of_row and names["net"] == table.net:
             return names["sampler"]
     return row.partition(" from ")[0]  # a baseline, or a row of another net
 
 
 def _paper_cells(published: dict[str, Any], sampler: str, columns: list[Any]) -> list[str]:
     """Return the paper's values of a sampler by size; empty if it has none of them."""
-    by_size = published.get("rows", {}).get(sampler, {})
+    rows = published.get("rows", {})
+    by_size = rows.get(sampler, {})
     cells = []
     for column in columns:
-        values = by_size.get(str(column), [])
-        cells.append(" / ".join(f"{value:.2f}" for value in values))
-    return cells if any(cells) else []
+        values = [f"{value:.2f}" for value in by_size.get(str(column), [])]
+        cells.append(" / ".join(values))
+    if not any(cells):
+        return []
+    return cells
 
 
 def _full_cells(table: Table, columns: list[Any]) -> list[str]:
@@ -162,16 +177,18 @@ def _by_net(table: Table) -> Grid:
     places = sorted(cells.index, key=_place_key)
     rows: list[list] = []
     for m, row in places:
-        rows.append([str(m), row, *cells.loc[(m, row), columns]])
+        line = cells.loc[(m, row), columns]
+        rows.append([str(m), row, *line])
     metric = table.full_metric
     label = "all points"
     if table.metric.full_cloud_metric:
         label += f" ({metric.title})"
     full = table.full[table.full["metric"] == metric.name]
     # Figures differ by seed where data depend on it; equal ones are of the same data.
-    tested = full.drop_duplicates(["net", "value"]).groupby("net")["value"]
-    means = tested.mean().map(metric.format).to_dict()
-    rows.append(["", label, *(means.get(net, "") for net in columns)])
+    different = full.drop_duplicates(["net", "value"])
+    means = different.groupby("net")["value"].mean()
+    texts = means.map(metric.format).to_dict()
+    rows.append(["", label, *[texts.get(net, "") for net in columns]])
     title = (
         f"Test {table.metric.title} of the same samples under several task nets: "
         f"{table.subject}; {_sets(table)}"
@@ -196,7 +213,7 @@ def _plane(table: Table, row: str) -> Grid:
 
     Below it is the range of its values by readout, a measure of sensitivity.
     """
-    down, across = (key.rpartition(".")[2] for key in table.planes[row])
+    down, across = (_last_name(key) for key in table.planes[row])
     of_row = table.cells(["row", "down"]).loc[row]
     in_order = of_row.sort_index().sort_index(axis=1)
     is_used = (in_order != "").any()
@@ -204,14 +221,19 @@ def _plane(table: Table, row: str) -> Grid:
     lines: list[list] = []
     for left, line in zip(cells.index, cells.to_numpy(), strict=True):
         lines.append([f"{left:g}", *line])
-    spreads = [_spread(table, row, readout) for readout in table.readouts(row)]
-    readouts = " / ".join(table.readouts(row))
+    readouts = table.readouts(row)
     title = (
         f"Test {table.metric.title} of {row}: {table.subject}, m={table.sizes}, "
-        f"under {table.net}; {readouts} sets."
+        f"under {table.net}; {' / '.join(readouts)} sets."
     )
-    head = [f"{down} \\ {across}", *(f"{value:g}" for value in cells.columns)]
-    return Grid(title, head, lines, [f"Spread over the plane of {row}: {', '.join(spreads)}."])
+    head = [f"{down} \\ {across}"]
+    head += [f"{value:g}" for value in cells.columns]
+    spreads = ", ".join(_spread(table, row, readout) for readout in readouts)
+    return Grid(title, head, lines, [f"Spread over the plane of {row}: {spreads}."])
+
+
+def _last_name(setting: str) -> str:
+    return setting.rpartition(".")[2]
 
 
 def _spread(table: Table, row: str, readout: str) -> str:
@@ -231,14 +253,16 @@ def _costs(table: Table) -> dict[str, str]:
     if table.group.column != "m":
         return {}
     records = table.group.records
+    _, seconds = collect.training_time(records)
     runs = pd.DataFrame(
         {
             "row": [table.row_names.of(record) for record in records],
             "m": [_trained_size(record) for record in records],
-            "seconds": collect.training_time(records)[1],
+            "seconds": seconds,
         }
     )
-    of_trainings = runs.dropna().groupby(["row", "m"])["seconds"].mean()
+    trainings = runs.dropna().groupby(["row", "m"])
+    of_trainings = trainings["seconds"].mean()
     costs = of_trainings.groupby("row").sum()
     return costs.map("{:,.0f} s".format).to_dict()
 
@@ -254,7 +278,8 @@ def _full_lines(table: Table) -> list[str]:
     published = _published(table, full_clouds=True)
     lines = []
     for record in sorted(table.group.records, key=_by_row_and_size):
-        figure = record.metrics.get(f"test/{FULL}/{metric.name}")
+        key = f"test/{FULL}/{metric.name}"
+        figure = record.metrics.get(key)
         if figure is None:
             continue
         net = collect.names(record)["net"]
@@ -263,7 +288,8 @@ def _full_lines(table: Table) -> list[str]:
             text = f"{metric.title} {text}"
         if net == table.net and "full" in published:
             text += f" (the paper: {published['full']:.2f})"
-        lines.append(f"{net} on all points{_after_joint(record)}: {text}.")
+        after = _after_joint(record)
+        lines.append(f"{net} on all points{after}: {text}.")
     return list(dict.fromkeys(lines))
 
 
@@ -295,10 +321,13 @@ def _published(table: Table, full_clouds: bool = False) -> dict[str, Any]:
     records = table.group.records
     if any(_changes_test_clouds(record) for record in records):
         return {}
-    metric = table.full_metric if full_clouds else table.metric
+    metric = table.metric
+    if full_clouds:
+        metric = table.full_metric
     is_joint = collect.trained_with(records[0]) == "joint"
-    names = table.names
-    return paper.published(names["task"], table.net, names["dataset"], metric.name, is_joint)
+    task = table.names["task"]
+    dataset = table.names["dataset"]
+    return paper.published(task, table.net, dataset, metric.name, is_joint)
 
 
 def _changes_test_clouds(record: RunRecord) -> bool:

@@ -43,7 +43,9 @@ def long_form(found: Sequence[RunRecord], rows: RowNames, keys: Sequence[str] = 
             parts = parse_metric_name(name)
             if parts is None or figure is None:
                 continue
-            m = record.config["m"] if parts.m is None else parts.m
+            m = parts.m
+            if m is None:
+                m = record.config["m"]
             tested = {
                 "m": m,
                 "readout": parts.readout,

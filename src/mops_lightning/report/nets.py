@@ -1,5 +1,6 @@
 """A table of task nets: their results on full clouds, their sizes and costs."""
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -49,7 +50,8 @@ def nets_grid(group: comparable.Group, metrics: Sequence[str] = ()) -> Grid:
     keys = _distinguishing(settings)
     rows = _by_row(found, settings, keys)
     titles = [info.title for info in infos]
-    head = ["net", *keys, "points", *titles, "MB", training_time(found)[0], PAPER]
+    cost, _ = training_time(found)
+    head = ["net", *keys, "points", *titles, "MB", cost, PAPER]
     lines = [row.cells(infos) for row in rows]
     table = pd.DataFrame(lines, columns=head)
     # Not every table has costs and figures of the paper.
@@ -57,11 +59,13 @@ def nets_grid(group: comparable.Group, metrics: Sequence[str] = ()) -> Grid:
         if not any(table[optional]):
             table = table.drop(columns=optional)
     names = collect.names(found[0])
-    title = f"No sampler was tested; {names['task']} on {names['dataset']} from all points."
+    task = f"{names['task']} on {names['dataset']}"
+    title = f"No sampler was tested; {task} from all points."
     if group.about:
         title += f" ({group.about})"
-    below = dirty_line(any(record.git["dirty"] for record in found))
-    return Grid(title, list(table), table.to_numpy().tolist(), below)
+    is_dirty = any(record.git["dirty"] for record in found)
+    cells = table.to_numpy().tolist()
+    return Grid(title, list(table), cells, dirty_line(is_dirty))
 
 
 @dataclass
@@ -79,8 +83,13 @@ class _Row:
     def cells(self, metrics: list[MetricInfo]) -> list[str]:
         """Return the texts of the row, over all its seeds."""
         first = self.records[0]
-        label = [collect.names(first)["net"], *self.settings, _points(first)]
-        texts = ["" if value is None else str(value) for value in label]
+        name = collect.names(first)["net"]
+        texts = []
+        for value in (name, *self.settings, _points(first)):
+            text = ""
+            if value is not None:
+                text = str(value)
+            texts.append(text)
         texts += [self._score(metric) for metric in metrics]
         texts.append(_megabytes(first))
         texts.append(_cost(self.records))
@@ -90,7 +99,8 @@ class _Row:
     def _score(self, metric: MetricInfo) -> str:
         """Return the cell of a metric; empty if no run has it."""
         key = f"test/{FULL}/{metric.name}"
-        values = pd.Series([record.metrics.get(key) for record in self.records])
+        figures = [record.metrics.get(key) for record in self.records]
+        values = pd.Series(figures)
         count = values.count()
         if not count:
             return ""
@@ -105,18 +115,24 @@ class _Row:
 def _megabytes(record: RunRecord) -> str:
     """Return the size of a record's net in float32; empty if it is not known."""
     parameters = record.parameters.get("task")
-    return "" if parameters is None else f"{BYTES * parameters / 1e6:.1f}"
+    if parameters is None:
+        return ""
+    return f"{BYTES * parameters / 1e6:.1f}"
 
 
 def _cost(records: list[RunRecord]) -> str:
     """Return the mean time of trainings; empty if none was recorded."""
-    seconds = pd.Series(training_time(records)[1], dtype=float).mean()
-    return "" if pd.isna(seconds) else f"{seconds:,.0f} s"
+    _, times = training_time(records)
+    seconds = pd.Series(times, dtype=float).mean()
+    if pd.isna(seconds):
+        return ""
+    return f"{seconds:,.0f} s"
 
 
 def _distinguishing(settings: list[dict[str, Any]]) -> list[str]:
     """Return the settings that differ between nets, sorted; those of single runs are left out."""
-    table = pd.DataFrame(settings).drop(columns=[*BY_RUN], errors="ignore")
+    table = pd.DataFrame(settings)
+    table = table.drop(columns=[*BY_RUN], errors="ignore")
     keys = []
     for key in sorted(table):
         values = table[key].dropna().map(str)
@@ -139,14 +155,16 @@ def _by_row(found: list[RunRecord], settings: list[dict[str, Any]], keys: list[s
     runs["seed"] = [seed(record) for record in found]
     runs["number"] = range(len(found))
     place = ["points", *keys, "net"]
-    last = runs.groupby([*place, "seed"], sort=False, dropna=False).tail(1)
+    same = runs.groupby([*place, "seed"], sort=False, dropna=False)
+    last = same.tail(1)
     in_order = last.sort_values(place, na_position="first")
     rows = []
     for _, of_net in in_order.groupby(place, sort=False, dropna=False):
         numbers = list(of_net["number"])
         of_first = settings[numbers[0]]
         values = [of_first.get(key) for key in keys]
-        rows.append(_Row(values, [found[number] for number in numbers]))
+        records = [found[number] for number in numbers]
+        rows.append(_Row(values, records))
     return rows
 
 
@@ -176,11 +194,11 @@ def _settings(found: list[RunRecord]) -> list[dict[str, Any]]:
 
 def _trainings(found: list[RunRecord], nets: list[dict[str, Any]]) -> list[str]:
     """Return the settings of trainings in which runs of one net and seed differ, sorted."""
-    same: dict[str, list[RunRecord]] = {}
+    same: dict[str, list[RunRecord]] = defaultdict(list)
     for record, net in zip(found, nets, strict=True):
         name = collect.names(record)["net"]
         place = repr([name, net, _points(record), seed(record)])
-        same.setdefault(place, []).append(record)
+        same[place].append(record)
     different: set[str] = set()
     for runs in same.values():
         different.update(comparable.varying(runs))
@@ -200,17 +218,20 @@ def _net(record: RunRecord) -> dict[str, Any]:
         if name == "_target_":
             if part:
                 net[part] = _module(str(value))
-        elif part and value is None:
-            net[NAMES.get(key, key)] = "none"
-        else:
-            net[NAMES.get(key, key)] = value
+            continue
+        shown = NAMES.get(key, key)
+        net[shown] = value
+        if part and value is None:
+            net[shown] = "none"
     return net
 
 
 def _module(target: str) -> str:
     """Return the name of the module of a class, such as ``fps`` of ``….samplers.fps.FPS``."""
     path, _, name = target.rpartition(".")
-    return path.rpartition(".")[2] if path else name
+    if not path:
+        return name
+    return path.rpartition(".")[2]
 
 
 def _arguments(record: RunRecord) -> dict[str, Any]:
@@ -231,10 +252,11 @@ def _metrics(found: list[RunRecord], requested: Sequence[str]) -> list[MetricInf
                 known.add(key.rpartition("/")[2])
     for name in requested:
         if name not in known:
-            raise UserError(f"--metric: no run has {name!r}.{did_you_mean(name, known)}")
+            hint = did_you_mean(name, known)
+            raise UserError(f"--metric: no run has {name!r}.{hint}")
     if requested:
         return [metric_info(name, found) for name in requested]
-    infos = in_summary_order(metric_info(name, found) for name in known)
+    infos = in_summary_order([metric_info(name, found) for name in known])
     return [info for info in infos if info.full_cloud_metric is None]  # the rest is 1 here
 
 
@@ -249,4 +271,6 @@ def _paper(record: RunRecord) -> str:
     metric = score([record])
     table = paper.published(names["task"], names["net"], names["dataset"], metric)
     figure = table.get("full")
-    return "" if figure is None else f"{figure:.2f}"
+    if figure is None:
+        return ""
+    return f"{figure:.2f}"

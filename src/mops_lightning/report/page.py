@@ -65,14 +65,19 @@ def render(
     own = files("mops_lightning.report")
     template = Template(own.joinpath("page.html").read_text())
     script = own.joinpath("page.js").read_text()
-    plotly = files("plotly").joinpath(PLOTLY).read_text() if clouds else ""
+    plotly = ""
+    view = ""
+    if clouds:
+        plotly = files("plotly").joinpath(PLOTLY).read_text()
+        view = VIEW.format(choice=html.escape(choice))
+    shown_remarks = [_remark(remark) for remark in remarks if remark]
     return template.substitute(
         title=html.escape(title),
         tables="\n".join(map(_table, grids)),
         plots="\n".join(map(_image, plots)),
-        clouds=VIEW.format(choice=html.escape(choice)) if clouds else "",
+        clouds=view,
         remarks_title=html.escape(remarks_title),
-        remarks="".join(map(_remark, filter(None, remarks))),
+        remarks="".join(shown_remarks),
         policy=_policy(script, plotly),
         plotly=plotly,
         script=script,
@@ -89,22 +94,24 @@ def _policy(script: str, plotly: str) -> str:
     allowed = [_hash(script)]
     if plotly:
         allowed += [_hash(plotly), "'unsafe-eval'"]
+    scripts = " ".join(allowed)
     return (
-        f"default-src 'none'; script-src {' '.join(allowed)}; style-src 'unsafe-inline'; "
-        "img-src data: blob:"
+        f"default-src 'none'; script-src {scripts}; style-src 'unsafe-inline'; img-src data: blob:"
     )
 
 
 def _hash(script: str) -> str:
     """Return the hash of a script, as a policy names it."""
     digest = hashlib.sha256(script.encode()).digest()
-    return f"'sha256-{base64.b64encode(digest).decode()}'"
+    text = base64.b64encode(digest).decode()
+    return f"'sha256-{text}'"
 
 
 def _remark(line: str) -> str:
     """Return a remark as an item of the list, or as a paragraph that interrupts it."""
     if line.startswith("- "):
-        return f"<li>{html.escape(line.removeprefix('- '))}</li>"
+        item = line.removeprefix("- ")
+        return f"<li>{html.escape(item)}</li>"
     return f"</ul><p>{html.escape(line)}</p><ul>"
 
 
@@ -121,8 +128,9 @@ def _table(grid: Grid) -> str:
     head = _tagged("th", names)
     body = "\n".join(f"<tr>{_tagged('td', cells)}</tr>" for cells in rows)
     below = _tagged("p", [html.escape(line) for line in grid.below])
+    title = html.escape(grid.title)
     return (
-        f"<p>{html.escape(grid.title)}</p>\n"
+        f"<p>{title}</p>\n"
         f'<div class="wide"><table><thead><tr>{head}</tr></thead>'
         f"<tbody>{body}</tbody></table></div>\n{below}"
     )
@@ -132,18 +140,22 @@ def _with_papers(ours: Sequence[str], theirs: Sequence[str]) -> list[str]:
     """Return the cells of a row with the paper's in small type below them."""
     cells = []
     for cell, published in zip(ours, theirs, strict=True):
-        small = f"<small>{published.strip('*')}</small>" if published else ""
+        small = ""
+        if published:
+            small = f"<small>{published.strip('*')}</small>"
         cells.append(cell + small)
     return cells
 
 
 def _tagged(tag: str, texts: Sequence[str]) -> str:
-    return "".join(f"<{tag}>{text}</{tag}>" for text in texts)
+    elements = [f"<{tag}>{text}</{tag}>" for text in texts]
+    return "".join(elements)
 
 
 def _image(path: Path) -> str:
     data = base64.b64encode(path.read_bytes()).decode()
-    return f'<img alt="{html.escape(path.stem)}" src="data:image/svg+xml;base64,{data}">'
+    title = html.escape(path.stem)
+    return f'<img alt="{title}" src="data:image/svg+xml;base64,{data}">'
 
 
 def _clouds(report: Report, folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
@@ -151,10 +163,11 @@ def _clouds(report: Report, folder: Path) -> tuple[list[dict[str, Any]], list[st
     groups: list[dict[str, Any]] = []
     damaged: list[str] = []
     for record in report.found.done:
-        path = Path(record.folder) / record.files.get("clouds", "")
+        run = Path(record.folder)
+        path = run / record.files.get("clouds", "")
         if not path.is_file() or len(groups) == MAX_RUNS:
             continue
-        name = str(Path(record.folder).relative_to(folder))
+        name = str(run.relative_to(folder))
         try:
             groups.append(_group_of_clouds(path, name))
         except (OSError, UserError) as error:
@@ -169,8 +182,10 @@ def _group_of_clouds(path: Path, name: str) -> dict[str, Any]:
     points = {}
     shown_in = {}
     for readout, array in arrays.items():
-        points[readout] = array.astype(float).round(3).tolist()
-        shown_in[readout] = f"rgb{colours.get(readout, COLOURS['sampled'])}"
+        rounded = array.astype(float).round(3)
+        points[readout] = rounded.tolist()
+        colour = colours.get(readout, COLOURS["sampled"])
+        shown_in[readout] = f"rgb{colour}"
     return {
         "name": name,
         "titles": titles,

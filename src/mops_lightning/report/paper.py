@@ -9,7 +9,8 @@ from typing import Any
 @cache
 def published_tables() -> dict[str, dict[str, Any]]:
     """Return all tables by name, each with its source; see ``paper.json``."""
-    return json.loads(files("mops_lightning.report").joinpath("paper.json").read_text())
+    file = files("mops_lightning.report").joinpath("paper.json")
+    return json.loads(file.read_text())
 
 
 def published(
@@ -21,9 +22,21 @@ def published(
         ``rows``: sampler → size → values of generated, matched and completed sets, or one value;
         ``full``, if the paper gives it: the value on all points.
     """
-    wanted = {"task": task, "dataset": dataset, "metric": metric, "net": net, "joint": joint}
+    wanted = {
+        "task": task,
+        "dataset": dataset,
+        "metric": metric,
+        "net": net,
+        "joint": joint,
+    }
+    defaults = {
+        "dataset": None,
+        "metric": None,
+        "net": net,
+        "joint": False,
+    }
     for table in published_tables().values():
-        given = {"dataset": None, "metric": None, "net": net, "joint": False} | table
+        given = defaults | table
         if all(given[name] == value for name, value in wanted.items()):
             return table
     return {}

@@ -17,7 +17,8 @@ from mops_lightning.report.tables import Table
 from mops_lightning.viz.figures import new_figure
 
 COLOURS: list[Any] = [f"C{number}" for number in range(10)]
-COLOURS += [colormaps["Dark2"](number) for number in range(8)]
+DARK = colormaps["Dark2"]
+COLOURS += [DARK(number) for number in range(8)]
 """Of curves, in the order of the rows."""
 
 LOG_SCALE_RATIO = 20
@@ -41,7 +42,9 @@ def plots(report: Report) -> dict[str, Figure]:
 def _new_name(name: str, figures: Mapping[str, Figure]) -> str:
     """Return a name, with a number behind it if other groups have figures of this name."""
     others = [other for other in figures if other.startswith(name)]
-    return f"{name}_{len(others) + 1}" if others else name
+    if not others:
+        return name
+    return f"{name}_{len(others) + 1}"
 
 
 def curves(table: Table) -> Figure:
@@ -54,14 +57,15 @@ def curves(table: Table) -> Figure:
     readouts = list(GENERATED_READOUTS)
     if PROJECTED in set(table.values["readout"]):
         readouts.append(PROJECTED)
+    number = len(readouts)
     is_wide = len(columns) > MAX_COLUMNS
     if is_wide:
-        figure = new_figure(0.16 * len(columns) + 2, 2.2 * len(readouts) + 1)
-        panels = figure.subplots(len(readouts), 1, sharex=True)
+        figure = new_figure(0.16 * len(columns) + 2, 2.2 * number + 1)
+        panels = figure.subplots(number, 1, sharex=True)
     else:
-        figure = new_figure(4.2 * len(readouts), 3.4)
-        panels = figure.subplots(1, len(readouts), sharey=True)
-    ticks = [column if isinstance(column, str) else f"{column:g}" for column in columns]
+        figure = new_figure(4.2 * number, 3.4)
+        panels = figure.subplots(1, number, sharey=True)
+    ticks = [_tick(column) for column in columns]
     for axis, readout in zip(panels, readouts, strict=True):
         _draw_curves(axis, table, readout, columns)
         axis.set(title=readout, xlabel=table.group.column, ylabel=table.metric.title)
@@ -72,6 +76,12 @@ def curves(table: Table) -> Figure:
         axis.label_outer()
     _add_legend(panels)
     return figure
+
+
+def _tick(value: str | float) -> str:
+    if isinstance(value, str):
+        return value
+    return f"{value:g}"
 
 
 def _draw_curves(axis: Any, table: Table, readout: str, columns: Sequence[Any]) -> None:
@@ -86,10 +96,11 @@ def _draw_curves(axis: Any, table: Table, readout: str, columns: Sequence[Any]) 
         values = table.of(name, shown).sort_values("column")
         if values.empty:
             continue
+        deviations = values["std"].fillna(0.0)
         axis.errorbar(
             [columns.index(column) for column in values["column"]],
             values["mean"] * scale,
-            yerr=values["std"].fillna(0.0) * scale,
+            yerr=deviations * scale,
             label=name,
             color=COLOURS[number % len(COLOURS)],
             linestyle=style,
@@ -106,7 +117,11 @@ def _add_legend(panels: Sequence[Any]) -> None:
         curves_of_panel, names = axis.get_legend_handles_labels()
         curve_of |= zip(names, curves_of_panel, strict=True)
     panels[-1].legend(
-        curve_of.values(), curve_of.keys(), fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5)
+        curve_of.values(),
+        curve_of.keys(),
+        fontsize=8,
+        loc="center left",
+        bbox_to_anchor=(1.0, 0.5),
     )
 
 
@@ -122,7 +137,7 @@ def heat_maps(table: Table) -> Figure:
     figure = new_figure(3.6 * width + 1, 3.2 * len(names))
     panels = figure.subplots(len(names), width, squeeze=False)
     for line, name in zip(panels, names, strict=True):
-        down, across = (key.split(".")[-1] for key in planes[name])
+        down, across = (key.rpartition(".")[2] for key in planes[name])
         of_row = table.values[table.values["row"] == name]
         norm = _colour_scale(of_row["mean"] * scale)
         for axis, readout in zip(line, table.readouts(name), strict=False):
@@ -147,12 +162,18 @@ def _colour_scale(means: pd.Series) -> Normalize:
 
 def _heat_map(axis: Any, plane: pd.DataFrame, norm: Normalize) -> Any:
     """Draw a plane with its numbers; return the image."""
-    for (row, column), value in np.ndenumerate(plane.to_numpy()):
+    cells = plane.to_numpy()
+    for (row, column), value in np.ndenumerate(cells):
         if np.isnan(value):
             continue
-        text = f"{value:.4g}" if value < 1e4 else f"{value:,.0f}"
-        colour = "white" if norm(value) < 0.5 else "black"
+        text = f"{value:,.0f}"
+        if value < 1e4:
+            text = f"{value:.4g}"
+        colour = "black"
+        if norm(value) < 0.5:
+            colour = "white"
         axis.text(column, row, text, ha="center", va="center", color=colour, fontsize=7)
-    axis.set_xticks(range(plane.shape[1]), [f"{x:g}" for x in plane.columns])
-    axis.set_yticks(range(plane.shape[0]), [f"{y:g}" for y in plane.index])
-    return axis.imshow(plane.to_numpy(), norm=norm, origin="lower", aspect="auto")
+    rows, columns = cells.shape
+    axis.set_xticks(range(columns), [_tick(x) for x in plane.columns])
+    axis.set_yticks(range(rows), [_tick(y) for y in plane.index])
+    return axis.imshow(cells, norm=norm, origin="lower", aspect="auto")

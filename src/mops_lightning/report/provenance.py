@@ -70,7 +70,8 @@ def collapses(found: list[RunRecord], net: str) -> list[str]:
                 counts[m].append(count)
         means = [f"{mean(counts[m]):.1f} of {m}" for m in sorted(counts)]
         shown = ", ".join(means)
-        text = f"collapsed: only {shown} matched points are distinct. {advice(records[-1])}."
+        hint = advice(records[-1])
+        text = f"collapsed: only {shown} matched points are distinct. {hint}."
         lines.append(f"- {kind}: {text}")
     return lines
 
@@ -80,9 +81,12 @@ def without_result(found: collect.Found) -> list[str]:
     if not found.undone:
         return []
     lines = [f"- {folder}: {why}" for folder, why in found.undone.items()]
-    verb = "has" if len(lines) == 1 else "have"
+    verb = "have"
+    if len(lines) == 1:
+        verb = "has"
     number = len(found.done) + len(lines)
-    return ["", f"{len(lines)} of {number} runs {verb} no full result:", "", *lines]
+    head = f"{len(lines)} of {number} runs {verb} no full result:"
+    return ["", head, "", *lines]
 
 
 def _kind(record: RunRecord, net: str) -> str:
@@ -100,11 +104,14 @@ def _kind(record: RunRecord, net: str) -> str:
 
 def _way(record: RunRecord) -> str:
     """Return how long, where and from which code a run was made."""
-    threads = "1 thread" if record.threads == 1 else f"{record.threads} threads"
+    threads = f"{record.threads} threads"
+    if record.threads == 1:
+        threads = "1 thread"
     code = f"commit {commit(record)}"
     if record.git["dirty"]:
         code += " with changes"
-    facts = [_length(record), f"seed {collect.seed(record)}", str(record.device), threads, code]
+    seed = f"seed {collect.seed(record)}"
+    facts = [_length(record), seed, str(record.device), threads, code]
     tags = record.config.get("tags")
     if tags:
         facts.append(f"tags {' '.join(tags)}")
@@ -116,5 +123,9 @@ def _length(record: RunRecord) -> str:
     number = collect.epochs(record)
     if number is None:
         return "nothing to train"
-    epochs = "1 epoch" if number == 1 else f"{number} epochs"
-    return epochs if "fit" in record.seconds else f"evaluated after {epochs}"
+    epochs = f"{number} epochs"
+    if number == 1:
+        epochs = "1 epoch"
+    if "fit" in record.seconds:
+        return epochs
+    return f"evaluated after {epochs}"

@@ -26,20 +26,21 @@ def ranked(table: pd.DataFrame, metric: MetricInfo) -> pd.DataFrame:
     table["level"] = False
     if metric.higher_is_better is None:
         return table
-    best_of = "max" if metric.higher_is_better else "min"
-    competition = [
-        table["readout"].replace({INDEX_READOUT: COMPLETED, PROJECTED: GENERATED}),
-        table["m"],
-        table["column"],
-        table["down"],
-    ]
+    best_of = "min"
+    if metric.higher_is_better:
+        best_of = "max"
+    readouts = table["readout"].replace({INDEX_READOUT: COMPLETED, PROJECTED: GENERATED})
+    competition = [readouts, table["m"], table["column"], table["down"]]
     shown = pd.to_numeric(table["mean"].map(metric.format))
     best = shown.groupby(competition).transform(best_of)
     is_best = shown == best
     deviation = metric.scale * table["std"].fillna(0.0)
-    deviation_of_best = deviation.where(is_best).groupby(competition).transform("max")
-    is_near = (shown - best).abs() < LEVEL * np.maximum(deviation, deviation_of_best)
-    second = shown.where(~is_best & ~is_near).groupby(competition).transform(best_of)
+    deviations_of_best = deviation.where(is_best)
+    deviation_of_best = deviations_of_best.groupby(competition).transform("max")
+    reach = LEVEL * np.maximum(deviation, deviation_of_best)
+    is_near = (shown - best).abs() < reach
+    others = shown.where(~is_best & ~is_near)
+    second = others.groupby(competition).transform(best_of)
     has_rivals = shown.groupby(competition).transform("count") > 1
     table["level"] = has_rivals & is_near & ~is_best
     table.loc[has_rivals & (shown == second), "rank"] = 2

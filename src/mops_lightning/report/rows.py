@@ -67,9 +67,10 @@ class RowNames:
             rows[_on_net(record, net)].append(record)
         for name, of_row in rows.items():
             keys = _telling_apart(of_row, columns)
-            classes = {str((record.config["sampler"] or {}).get("_target_")) for record in of_row}
+            classes = {_class_of_sampler(record) for record in of_row}
             for record in of_row:
-                self._names[record.folder] = " ".join([name, *_texts(record, keys, classes)])
+                words = [name, *_texts(record, keys, classes)]
+                self._names[record.folder] = " ".join(words)
 
     def of(self, record: RunRecord) -> str:
         """Return the row of a record's own results."""
@@ -79,8 +80,14 @@ class RowNames:
         """Return the row of a value: its run's sampler, or a baseline of the run."""
         if readout in (*READOUTS, FULL):
             return self.of(record)
-        on_net = _on_net(record, self.net).removesuffix(collect.sampler_row(record))
+        whole = _on_net(record, self.net)
+        on_net = whole.removesuffix(collect.sampler_row(record))
         return on_net + baseline_name(record.config, readout)  # such as "dgcnn on fps"
+
+
+def _class_of_sampler(record: RunRecord) -> str:
+    sampler = record.config["sampler"] or {}
+    return str(sampler.get("_target_"))
 
 
 def _on_net(record: RunRecord, net: str) -> str:
@@ -94,17 +101,17 @@ def _on_net(record: RunRecord, net: str) -> str:
 
 def _telling_apart(records: Sequence[RunRecord], columns: Sequence[str]) -> list[str]:
     """Return the arguments of a row's samplers in which runs for one cell differ."""
+    own = [key.removeprefix("sampler.") for key in columns]
     cells: dict[Any, list[dict[str, Any]]] = defaultdict(list)
     for record in records:
         settings = dotted(record.config["sampler"])
-        place = tuple(repr(settings.get(key.removeprefix("sampler."))) for key in columns)
+        place = tuple(repr(settings.get(key)) for key in own)
         for m in _sizes(record):
             cells[place, m].append(settings)
     different: set[str] = set()
     for of_cell in cells.values():
         different |= _different(of_cell)
-    own = {key.removeprefix("sampler.") for key in columns}
-    return sorted(different - own - set(NOT_IN_NAMES))
+    return sorted(different.difference(own, NOT_IN_NAMES))
 
 
 def _different(several: Sequence[dict[str, Any]]) -> set[str]:
@@ -127,7 +134,10 @@ def _sizes(record: RunRecord) -> set[int]:
         name = parse_metric_name(key)
         if name is None or name.readout not in READOUTS:
             continue
-        sizes.add(record.config["m"] if name.m is None else name.m)
+        m = name.m
+        if m is None:
+            m = record.config["m"]
+        sizes.add(m)
     return sizes
 
 
@@ -141,14 +151,16 @@ def _texts(record: RunRecord, keys: Sequence[str], classes: set[str]) -> list[st
     """
     settings = dotted(record.config["sampler"])
     last_names = {name.rpartition(".")[2] for name in classes}
+    are_unique = len(last_names) == len(classes)
     texts = []
     for key in keys:
-        if key == "_target_" and len(last_names) == len(classes):
-            texts.append(str(settings.get(key)).rpartition(".")[2])
-        elif key == "_target_":
-            texts.append(str(settings.get(key)))
+        value = str(settings.get(key))
+        if key != "_target_":
+            texts.append(f"{key}={value}")
+        elif are_unique:
+            texts.append(value.rpartition(".")[2])
         else:
-            texts.append(f"{key}={settings.get(key)}")
+            texts.append(value)
     return texts
 
 
@@ -161,7 +173,8 @@ def net_labels(found: Sequence[RunRecord]) -> list[str]:
     for record in found:
         label = _net_label(record)
         if len(digests[label]) > 1:
-            label += f" {str(record.task_weights_sha256)[:8]}"
+            digest = str(record.task_weights_sha256)
+            label += f" {digest[:8]}"
         labels.append(label)
     return labels
 
@@ -173,8 +186,11 @@ def _net_label(record: RunRecord) -> str:
         return f"{name} of the training"
     if given in (None, "auto", "run"):
         return name
-    file = Path(str(given).partition("@")[0]).name
-    return file if file.startswith(name) else f"{name} ({file})"
+    path = str(given).partition("@")[0]
+    file = Path(path).name
+    if file.startswith(name):
+        return file
+    return f"{name} ({file})"
 
 
 def sort_key(row: str) -> tuple[bool, int, str]:

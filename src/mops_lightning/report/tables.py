@@ -85,7 +85,8 @@ class Table:
     @property
     def subject(self) -> str:
         """The task and the data, for titles."""
-        return f"{self.names['task']} on {self.names['dataset']}"
+        names = self.names
+        return f"{names['task']} on {names['dataset']}"
 
     @property
     def sizes(self) -> str:
@@ -106,7 +107,8 @@ class Table:
 
     def columns(self) -> list[Any]:
         """Return all columns: sizes from the largest, other values from the smallest."""
-        return sorted(self.values["column"].unique(), reverse=self.group.column == "m")
+        is_by_size = self.group.column == "m"
+        return sorted(self.values["column"].unique(), reverse=is_by_size)
 
     def rows(self) -> list[str]:
         """Return all rows in the paper's order, rows of other nets last."""
@@ -114,7 +116,8 @@ class Table:
 
     def readouts(self, row: str) -> list[str]:
         """Return the readouts of a row, in their order."""
-        present = set(self.values.loc[self.values["row"] == row, "readout"])
+        is_of_row = self.values["row"] == row
+        present = set(self.values.loc[is_of_row, "readout"])
         return [name for name in READOUTS if name in present]
 
     def of(self, row: str, readout: str) -> pd.DataFrame:
@@ -125,11 +128,14 @@ class Table:
     def cells(self, index: Sequence[str]) -> pd.DataFrame:
         """Return the cells by columns of ``values`` and by ``column``; empty texts for none."""
         keys = [*index, "column"]
-        cells = self.values.groupby(keys, sort=False)[list(self.values)].apply(self._cell)
+        groups = self.values.groupby(keys, sort=False)[list(self.values)]
+        cells = groups.apply(self._cell)
         return cells.unstack("column", fill_value="")
 
     def _cell(self, values: pd.DataFrame) -> Cell:
-        by_readout: dict[str, Any] = {value.readout: value for value in values.itertuples()}
+        by_readout: dict[str, Any] = {}
+        for value in values.itertuples():
+            by_readout[value.readout] = value
         parts = []
         for name in READOUTS:
             if name in by_readout:
@@ -180,7 +186,8 @@ def _planes(group: Group, rows: RowNames) -> dict[str, list[str]]:
     planes: dict[str, list[str]] = {}
     if group.planes:
         for record in group.records:
-            planes[rows.of(record)] = group.planes[sampler_row(record)]
+            sampler = sampler_row(record)
+            planes[rows.of(record)] = group.planes[sampler]
     return planes
 
 
@@ -193,8 +200,9 @@ def _placed(long: pd.DataFrame, group: Group, rows: RowNames) -> pd.DataFrame:
     long["column"] = 0.0
     for name, (down, across) in _planes(group, rows).items():
         in_row = long["sampler"] == name
-        long.loc[in_row, "down"] = long.loc[in_row, down].to_numpy(float)
-        long.loc[in_row, "column"] = long.loc[in_row, across].to_numpy(float)
+        of_row = long.loc[in_row]
+        long.loc[in_row, "down"] = of_row[down].to_numpy(float)
+        long.loc[in_row, "column"] = of_row[across].to_numpy(float)
     return long
 
 
@@ -207,8 +215,9 @@ def _tested(long: pd.DataFrame, metric: str, group: Group) -> pd.DataFrame:
     Raises:
         UserError: there is none.
     """
-    is_shown = (long["metric"] == metric) & (long["readout"] != FULL)
-    values = long[is_shown].copy()
+    is_tested = long["metric"] == metric
+    is_sampled = long["readout"] != FULL
+    values = long[is_tested & is_sampled].copy()
     if values.empty:
         hint = did_you_mean(metric, set(long["metric"]))
         raise UserError(f"--metric: no run has {metric!r}.{hint}")
@@ -219,16 +228,19 @@ def _tested(long: pd.DataFrame, metric: str, group: Group) -> pd.DataFrame:
     if group.planes:
         values = values[values["own"]]
     # Joint training gives each run its own task net, under which its baselines ran too.
-    values = values[values["own"] | (values["learn"] != "joint")]
+    is_shared = values["learn"] != "joint"
+    values = values[values["own"] | is_shared]
     values["readout"] = values["readout"].where(values["own"], INDEX_READOUT)
-    has_own_run = values.groupby(PLACE, dropna=False)["own"].transform("any")
+    places = values.groupby(PLACE, dropna=False)
+    has_own_run = places["own"].transform("any")
     values = values[values["own"] | ~has_own_run]
     return values.sort_values("started", kind="stable")
 
 
 def _replaced_later(values: pd.DataFrame) -> pd.Series:
     """Return which values a later run replaces: one with the same place and seed."""
-    latest = values.groupby([*PLACE, "seed"])["folder"].transform("last")
+    runs = values.groupby([*PLACE, "seed"])
+    latest = runs["folder"].transform("last")
     return values["folder"] != latest
 
 
@@ -246,9 +258,12 @@ def over_seeds(metric: MetricInfo, mean: float, std: float) -> str:
     if pd.isna(std):
         return text
     # As many decimals as the mean has, at least two.
-    decimals = "" if "e" in text else text.partition(".")[2]
+    decimals = ""
+    if "e" not in text:
+        decimals = text.partition(".")[2]
     places = max(len(decimals), 2)
-    return f"{text} ± {metric.scale * std:.{places}f}"
+    deviation = metric.scale * std
+    return f"{text} ± {deviation:.{places}f}"
 
 
 def dirty_line(is_dirty: bool) -> list[str]:

@@ -55,7 +55,8 @@ def markdown(grids: list[Grid], remarks: list[str]) -> str:
     lines: list[str] = []
     for grid in grids:
         lines += [_escaped(grid.title), ""]
-        lines += [_line(grid.head), _rule(len(grid.head))]
+        lines.append(_line(grid.head))
+        lines.append(_rule(len(grid.head)))
         lines += [_line(row) for row in grid.rows]
         lines.append("")
         if grid.below:
@@ -66,7 +67,8 @@ def markdown(grids: list[Grid], remarks: list[str]) -> str:
 
 
 def _line(cells: Sequence[str | Cell]) -> str:
-    return f"| {' | '.join(_cell(cell) for cell in cells)} |"
+    texts = [_cell(cell) for cell in cells]
+    return f"| {' | '.join(texts)} |"
 
 
 def _cell(cell: str | Cell) -> str:
@@ -117,12 +119,14 @@ def latex(grids: list[Grid], remarks: list[str]) -> str:
             r"\end{tabular}",
             r"\end{table}",
         ]
-        parts.append("\n".join(lines) + "\n" + _comments(grid.below))
+        text = "\n".join(lines)
+        parts.append(f"{text}\n{_comments(grid.below)}")
     return "\n".join(parts) + _comments(remarks)
 
 
 def _comments(lines: list[str]) -> str:
-    return "".join(f"% {_ascii(' '.join(line.split()))}\n" for line in lines)
+    texts = [" ".join(line.split()) for line in lines]
+    return "".join(f"% {_ascii(text)}\n" for text in texts)
 
 
 def _tex_line(cells: Sequence[str | Cell]) -> str:
@@ -132,9 +136,11 @@ def _tex_line(cells: Sequence[str | Cell]) -> str:
 
 def _tex(text: str) -> str:
     if text.startswith("*") and text.endswith("*"):
-        return f"\\emph{{{_tex(text[1:-1])}}}"
+        inside = _tex(text[1:-1])
+        return f"\\emph{{{inside}}}"
     line = " ".join(text.splitlines())
-    return "".join(TEX.get(letter) or _ascii(letter) for letter in line)
+    letters = [TEX.get(letter) or _ascii(letter) for letter in line]
+    return "".join(letters)
 
 
 def _ascii(text: str) -> str:

@@ -60,7 +60,13 @@ def new_figure(width: float, height: float, layout: Any = "constrained") -> Figu
 
 
 def cloud_axes(
-    figure: Figure, rows: int, columns: int, row: int, column: int, title: str = "", label: str = ""
+    figure: Figure,
+    rows: int,
+    columns: int,
+    row: int,
+    column: int,
+    title: str = "",
+    label: str = "",
 ) -> Axes3D:
     """Add 3-D axes to a grid of clouds.
 
@@ -91,12 +97,12 @@ def save_figure(figure: Figure, path: Path, dpi: float = 110, software: str = ""
         dpi: resolution of a PNG, and of the images in an SVG.
         software: what wrote it, for the metadata; empty: none in a PNG, matplotlib's in an SVG.
     """
-    creator: dict[str, str] = {}
-    if software:
-        creator["Creator"] = software
     buffer = io.BytesIO()
     if path.suffix == ".svg":
-        figure.savefig(buffer, format="svg", dpi=dpi, metadata={"Date": None, **creator})
+        metadata: dict[str, Any] = {"Date": None}
+        if software:
+            metadata["Creator"] = software
+        figure.savefig(buffer, format="svg", dpi=dpi, metadata=metadata)
         content = buffer.getvalue()
     else:
         figure.savefig(buffer, format="png", dpi=dpi)
@@ -141,11 +147,16 @@ def cloud_grid(
     if channel is not None:
         colours = colours_by_channel(channel, {INPUT: points, **readouts})
     number = len(points)
-    figure = new_figure(2.6 * len(columns), 2.6 * number, "tight")
+    inches = 2.6
+    figure = new_figure(inches * len(columns), inches * number, "tight")
     for row, cloud in enumerate(upright(coordinates(points))):
         for column, (name, samples) in enumerate(columns.items()):
-            title = name if row == 0 else ""
-            label = titles[row] if column == 0 else ""
+            title = ""
+            if row == 0:
+                title = name
+            label = ""
+            if column == 0:
+                label = titles[row]
             axes = cloud_axes(figure, number, len(columns), row, column, title, label)
             drawn = None
             if samples is not None:
@@ -165,7 +176,8 @@ def colours_by_channel(channel: int, sets: Mapping[str, Tensor]) -> dict[str, np
     """
     values = {}
     for name, points in sets.items():
-        values[name] = points[..., channel].detach().cpu().numpy()
+        of_channel = points[..., channel].detach()
+        values[name] = of_channel.cpu().numpy()
     low, high = np.percentile(values[INPUT], (1, 99))
     spread = 1.0
     if high > low:
@@ -233,20 +245,27 @@ def _draw_whole(axes: Axes3D, cloud: np.ndarray, colours: np.ndarray | None) -> 
     colour: Any = colours
     if colour is None:
         colour = "0.35"
-    axes.scatter(*cloud.T, s=3, color=colour, alpha=1.0, depthshade=False, rasterized=True)
+    style = {"alpha": 1.0, "depthshade": False, "rasterized": True}
+    axes.scatter(*cloud.T, s=3, color=colour, **style)
 
 
 def _draw_faint(axes: Axes3D, cloud: np.ndarray) -> None:
     colour = np.array(INPUT_COLOUR) / 255
-    axes.scatter(*cloud.T, s=1, color=colour, alpha=0.35, depthshade=False, rasterized=True)
+    style: dict[str, Any] = {"alpha": 0.35, "depthshade": False, "rasterized": True}
+    axes.scatter(*cloud.T, s=1, color=colour, **style)
 
 
 def _draw_samples(
-    axes: Axes3D, samples: np.ndarray, readout: str, size: float, colours: np.ndarray | None
+    axes: Axes3D,
+    samples: np.ndarray,
+    readout: str,
+    size: float,
+    colours: np.ndarray | None,
 ) -> None:
     colour = colours
     if colour is None:
-        colour = np.array(COLOURS.get(readout, COLOURS["sampled"])) / 255
+        of_readout = COLOURS.get(readout, COLOURS["sampled"])
+        colour = np.array(of_readout) / 255
     number = max(len(samples), 1)
     shrink = min(1, LARGE_MARKER_SAMPLES / number)
     marker = max(size * shrink, 1.5)
@@ -264,14 +283,14 @@ def matrix_figure(dense: Tensor, gram: Tensor, title: str) -> Figure:
         title: the cloud and sampler of the matrix.
     """
     values = dense.detach().cpu()
-    columns = values.shape[1]
+    points, columns = values.shape
     strongest = values.argmax(1)
     # An entry is at most 1, so the column decides, and the entry where columns are equal.
-    order = strongest.mul(2.0).sub(values.amax(1)).argsort()
-    rows = adaptive_max_pool1d(values[order].T, min(MATRIX_ROWS, len(values))).T
-    extent = (-0.5, columns - 0.5, len(values) - 0.5, -0.5)
+    places = strongest.mul(2.0).sub(values.amax(1))
+    in_order = values[places.argsort()]
+    rows = adaptive_max_pool1d(in_order.T, min(MATRIX_ROWS, points)).T
+    extent = (-0.5, columns - 0.5, points - 0.5, -0.5)
     scale: dict[str, Any] = {"vmin": 0, "vmax": 1, "cmap": "viridis"}
-
     figure = new_figure(9, 4.4)
     left, right = figure.subplots(1, 2, gridspec_kw={"wspace": 0.08})
     left.imshow(rows.numpy(), aspect="auto", interpolation="nearest", extent=extent, **scale)
@@ -295,8 +314,11 @@ def upright(points: Tensor | np.ndarray) -> np.ndarray:
 
 def frame_cloud(axes: Axes3D, cloud: np.ndarray) -> None:
     """Fit the axes to a cloud with equal scales, and hide them."""
-    x, y, z = (cloud.max(0) + cloud.min(0)) / 2
-    reach = np.ptp(cloud, axis=0).max() / 2 or 1.0
+    low = cloud.min(0)
+    high = cloud.max(0)
+    x, y, z = (high + low) / 2
+    longest = np.ptp(cloud, axis=0).max()
+    reach = longest / 2 or 1.0
     axes.set_xlim(x - reach, x + reach)
     axes.set_ylim(y - reach, y + reach)
     axes.set_zlim(z - reach, z + reach)
@@ -338,7 +360,10 @@ def thinned(points: Any) -> Any:
 
 
 def save_clouds(
-    path: Path, points: Tensor, sampled: Mapping[str, Tensor], titles: Sequence[str]
+    path: Path,
+    points: Tensor,
+    sampled: Mapping[str, Tensor],
+    titles: Sequence[str],
 ) -> None:
     """Write clouds and their samples.
 
@@ -380,6 +405,7 @@ def load_clouds(path: Path) -> tuple[list[str], dict[str, NDArray[np.float32]]]:
 def _are_clouds(clouds: Mapping[str, NDArray[Any]], number: int) -> bool:
     """Return whether the input and at least one sample are finite ``(number, points, 3)``."""
     for cloud in clouds.values():
-        if cloud.shape[::2] != (number, 3) or not np.isfinite(cloud).all():
+        has_shape = cloud.shape[::2] == (number, 3)
+        if not has_shape or not np.isfinite(cloud).all():
             return False
     return len(clouds) >= 2

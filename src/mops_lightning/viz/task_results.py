@@ -34,7 +34,8 @@ class _Grid(NamedTuple):
     @classmethod
     def of(cls, rows: int, columns: int, inches: float) -> "_Grid":
         """Return an empty grid of square cells with sides of so many inches."""
-        return cls(new_figure(inches * columns, inches * rows, "tight"), rows, columns)
+        figure = new_figure(inches * columns, inches * rows, "tight")
+        return cls(figure, rows, columns)
 
     def axes(self, row: int, column: int, title: str, label: str) -> Axes3D:
         """Add the axes of one cell."""
@@ -77,12 +78,18 @@ def pair_grid(
     """
     grid = _Grid.of(len(source), 1 + len(aligned), 2.8)
     for row, title in enumerate(titles):
-        head = "before (centred)" if row == 0 else ""
+        is_first = row == 0
+        head = ""
+        if is_first:
+            head = "before (centred)"
         axes = grid.axes(row, 0, head, f"{title}, {before[row]:.1f}° apart")
         _draw_whole_pair(axes, source[row], target[row])
         for column, (name, result) in enumerate(aligned.items(), start=1):
-            head = f"by {name}" if row == 0 else ""
-            axes = grid.axes(row, column, head, f"rotation error {result.errors[row]:.1f}°")
+            head = ""
+            if is_first:
+                head = f"by {name}"
+            error = result.errors[row]
+            axes = grid.axes(row, column, head, f"rotation error {error:.1f}°")
             _draw_whole_pair(axes, result.source[row], target[row])
             if result.source_points.shape[1] < source.shape[1]:
                 _draw_rings(axes, result.source_points[row], result.target_points[row])
@@ -100,8 +107,10 @@ def _draw_rings(axes: Axes3D, source: Tensor, target: Tensor) -> None:
 
 
 def _draw_pair(axes: Axes3D, source: Tensor, target: Tensor, **style: Any) -> None:
-    axes.scatter(*upright(source).T, color=SOURCE_COLOUR, depthshade=False, **style)
-    axes.scatter(*upright(target).T, color=TARGET_COLOUR, depthshade=False, **style)
+    blue = upright(source)
+    orange = upright(target)
+    axes.scatter(*blue.T, color=SOURCE_COLOUR, depthshade=False, **style)
+    axes.scatter(*orange.T, color=TARGET_COLOUR, depthshade=False, **style)
 
 
 class ReconstructionResult(NamedTuple):
@@ -119,7 +128,10 @@ class ReconstructionResult(NamedTuple):
 
 
 def reconstruction_grid(
-    points: Tensor, full: Tensor, results: Mapping[str, ReconstructionResult], titles: Sequence[str]
+    points: Tensor,
+    full: Tensor,
+    results: Mapping[str, ReconstructionResult],
+    titles: Sequence[str],
 ) -> Figure:
     """Draw every cloud in two rows: the input and its samples above, their reconstructions below.
 
@@ -136,17 +148,23 @@ def reconstruction_grid(
     for number, cloud in enumerate(map(thinned, upright(points))):
         above = 2 * number
         under = above + 1
-        is_first = number == 0
-        axes = grid.axes(above, 0, "input" if is_first else "", titles[number])
+        input_title = ""
+        if number == 0:
+            input_title = "input"
+        axes = grid.axes(above, 0, input_title, titles[number])
         _draw_depth(axes, cloud, cloud)
         axes = grid.axes(under, 0, "from all points", "")
         _draw_depth(axes, thinned(from_all[number]), cloud)
         for column, (name, result) in enumerate(results.items(), start=1):
             samples = upright(result.samples)[number]
-            axes = grid.axes(above, column, name if is_first else "", f"{len(samples)} points")
+            title = ""
+            if number == 0:
+                title = name
+            axes = grid.axes(above, column, title, f"{len(samples)} points")
             draw_cloud(axes, cloud, samples, name, size=16)
             reconstruction = thinned(upright(result.points)[number])
-            axes = grid.axes(under, column, f"from {name}", f"NRE {result.ratios[number]:.2f}")
+            ratio = result.ratios[number]
+            axes = grid.axes(under, column, f"from {name}", f"NRE {ratio:.2f}")
             _draw_depth(axes, reconstruction, cloud)
     return grid.figure
 
@@ -168,8 +186,12 @@ def part_grid(points: Tensor, parts: Mapping[str, Tensor], titles: Sequence[str]
     }
     for row, cloud in enumerate(map(thinned, upright(points))):
         for column, (name, numbers) in enumerate(parts.items()):
-            title = name if row == 0 else ""
-            label = titles[row] if column == 0 else ""
+            title = ""
+            if row == 0:
+                title = name
+            label = ""
+            if column == 0:
+                label = titles[row]
             axes = grid.axes(row, column, title, label)
             of_points = numbers[row].cpu()[:, None]
             drawn = thinned(of_points)[:, 0]
@@ -180,5 +202,6 @@ def part_grid(points: Tensor, parts: Mapping[str, Tensor], titles: Sequence[str]
 
 def _draw_depth(axes: Axes3D, drawn: np.ndarray, cloud: np.ndarray) -> None:
     """Draw points coloured by depth, framed as ``cloud``."""
-    axes.scatter(*drawn.T, s=2, c=drawn[:, 1], cmap="viridis", depthshade=False)
+    heights = drawn[:, 1]
+    axes.scatter(*drawn.T, s=2, c=heights, cmap="viridis", depthshade=False)
     frame_cloud(axes, cloud)
