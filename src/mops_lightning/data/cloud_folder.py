@@ -230,6 +230,7 @@ def _repeated(values: Tensor, number: int) -> Tensor:
 
 
 def _parts(found: NDArray[np.int64], numbers: NDArray[np.int64]) -> Tensor:
+    """Return the position of every part number among the known ones, or ``UNKNOWN``."""
     positions = np.searchsorted(numbers, found)
     return torch.from_numpy(np.where(found < 0, UNKNOWN, positions))
 

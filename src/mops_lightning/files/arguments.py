@@ -22,7 +22,10 @@ Add = Callable[..., object]
 
 
 def parsed(
-    arguments: list[str], prog: str, description: str, declare: Callable[[Add], None]
+    arguments: list[str],
+    prog: str,
+    description: str,
+    declare: Callable[[Add], None],
 ) -> argparse.Namespace:
     """Parse the arguments of a subcommand, which ``declare`` adds to the parser."""
     parser = Parser(prog, description)
@@ -32,17 +35,22 @@ def parsed(
 
 def columns_of(chosen: argparse.Namespace) -> tuple[str, ...] | None:
     """Return the names that ``--columns`` gives, or None."""
-    return None if chosen.columns is None else parse_columns(chosen.columns)
+    if chosen.columns is None:
+        return None
+    return parse_columns(chosen.columns)
 
 
 def numbers(text: str) -> list[int]:
     """Return the whole numbers in a word of the command line, such as ``8`` or ``8,16,32``."""
-    return [int(part) for part in text.split(",") if part.strip()]
+    words = [word for word in text.split(",") if word.strip()]
+    return [int(word) for word in words]
 
 
 def counted(number: int, noun: str) -> str:
     """Return a number with its noun, such as ``1 point`` or ``1,200 points``."""
-    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
+    if number == 1:
+        return f"{number:,} {noun}"
+    return f"{number:,} {noun}s"
 
 
 def one_of(weights: Sequence[str] | None) -> str | None:
@@ -53,7 +61,9 @@ def one_of(weights: Sequence[str] | None) -> str | None:
     """
     if weights and len(weights) > 1:
         raise UserError(f"several --weights are for --task-net, got {', '.join(weights)}.")
-    return weights[0] if weights else None
+    if not weights:
+        return None
+    return weights[0]
 
 
 def check_out(folder: Path, overwrite: bool, written: Sequence[str] = COMPARED) -> None:
@@ -70,7 +80,9 @@ def check_out(folder: Path, overwrite: bool, written: Sequence[str] = COMPARED) 
     if folder.exists() and not folder.is_dir():
         raise UserError(f"--out must be a folder, got the file {folder}.")
     found = {path.name for path in folder.glob("[!.]*")}
-    if other := sorted(found.difference(written)):
-        raise UserError(f"--out: {folder} has other files, such as {other[0]}. Give a new one.")
+    others = sorted(found.difference(written))
+    if others:
+        raise UserError(f"--out: {folder} has other files, such as {others[0]}. Give a new one.")
     if found and not overwrite:
-        raise UserError(f"--out: {folder / max(found)} exists. Give another, or --overwrite.")
+        last = folder / max(found)
+        raise UserError(f"--out: {last} exists. Give another, or --overwrite.")

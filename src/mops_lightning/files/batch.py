@@ -6,7 +6,7 @@ Worker processes import this module, so it imports torch only when there is a fi
 import os
 import sys
 import time
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Generator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -66,44 +66,71 @@ def find_inputs(source: Path, target: Path) -> Inputs:
         raise UserError(f"{source}: no such file or folder.")
     if realpath(target) == realpath(source):
         raise UserError(f"OUT must differ from IN, got {source} for both.")
-    if blocking := next((p for p in target.parents if p.exists() and not p.is_dir()), None):
-        raise UserError(f"OUT: {blocking} is a file, not a folder. Give another OUT.")
+    for parent in target.parents:
+        if parent.exists() and not parent.is_dir():
+            raise UserError(f"OUT: {parent} is a file, not a folder. Give another OUT.")
     if is_many(source):
         return _several(source, target)
     if target.is_dir():
         target = _output(source, target / source.name)
-    if target.suffix.lower() == ".e57":
+    suffix = target.suffix.lower()
+    if suffix == ".e57":
         raise UserError(f"{target}: {NO_E57}")
-    if target.suffix.lower() not in WRITERS:
-        raise UserError(f"OUT must end in one of {', '.join(WRITERS)}, got {target}.")
+    if suffix not in WRITERS:
+        endings = ", ".join(WRITERS)
+        raise UserError(f"OUT must end in one of {endings}, got {target}.")
     return Inputs([(source, target)], [])
 
 
 def _several(source: Path, target: Path) -> Inputs:
     """Return the files of a folder or a pattern."""
-    base, pattern = (source, "**/*") if source.is_dir() else (source.parent, source.name)
+    if source.is_dir():
+        base = source
+        pattern = "**/*"
+    else:
+        base = source.parent
+        pattern = source.name
     files = _files(base, pattern, target)
-    readable = [path for path in files if path.suffix.lower() in READABLE]
+    readable = [path for path in files if _is_readable(path)]
     if not readable:
-        raise UserError(f"{base / pattern}: no file ends in {', '.join(READABLE)}.")
-    pairs = [(path, _output(path, target / path.relative_to(base))) for path in readable]
-    targets = Counter(path for _, path in pairs)
-    if twice := next((path for path, number in targets.items() if number > 1), None):
-        both = " and ".join(str(path) for path, output in pairs if output == twice)
-        raise UserError(f"{both} have the same output {twice}. Rename one.")
-    unreadable = [path for path in files if path.suffix.lower() not in READABLE]
+        endings = ", ".join(READABLE)
+        raise UserError(f"{base / pattern}: no file ends in {endings}.")
+    pairs = []
+    for path in readable:
+        beside = target / path.relative_to(base)
+        pairs.append((path, _output(path, beside)))
+    _check_different(pairs)
+    unreadable = [path for path in files if not _is_readable(path)]
     return Inputs(pairs, unreadable)
+
+
+def _is_readable(path: Path) -> bool:
+    return path.suffix.lower() in READABLE
+
+
+def _check_different(pairs: list[FilePair]) -> None:
+    """Check that no two files have the same output."""
+    sources: dict[Path, list[str]] = defaultdict(list)
+    for source, target in pairs:
+        sources[target].append(str(source))
+    for target, same in sources.items():
+        if len(same) > 1:
+            both = " and ".join(same)
+            raise UserError(f"{both} have the same output {target}. Rename one.")
 
 
 def is_many(source: Path) -> bool:
     """Return whether a path is a folder, or a pattern such as ``county/*.laz``."""
-    return source.is_dir() or not (source.exists() or set("*?[").isdisjoint(source.name))
+    has_wildcards = not set("*?[").isdisjoint(source.name)
+    return source.is_dir() or (has_wildcards and not source.exists())
 
 
 def _output(source: Path, path: Path) -> Path:
     """Return ``path`` with the suffix of ``source``, or .ply where that cannot be written."""
     own = source.suffix.lower()
-    return path.with_suffix(own if own in WRITERS else ".ply")
+    if own not in WRITERS:
+        own = ".ply"
+    return path.with_suffix(own)
 
 
 def _files(folder: Path, pattern: str, target: Path) -> list[Path]:
@@ -111,13 +138,13 @@ def _files(folder: Path, pattern: str, target: Path) -> list[Path]:
     if target.is_file():
         raise UserError(f"OUT must be a folder because IN is several, got the file {target}.")
     outputs = Path(realpath(target))
-    return sorted(
-        path
-        for path in folder.glob(pattern)
-        if path.is_file() and not is_temporary(path)
-        if not path.name.startswith(".") or path.suffix.lower() in READABLE
-        if outputs not in Path(realpath(path)).parents
-    )
+    files = []
+    for path in folder.glob(pattern):
+        is_file = path.is_file() and not is_temporary(path)
+        is_shown = not path.name.startswith(".") or _is_readable(path)
+        if is_file and is_shown and outputs not in Path(realpath(path)).parents:
+            files.append(path)
+    return sorted(files)
 
 
 def attempt(
@@ -141,7 +168,8 @@ def attempt(
     if workers:
         import torch
 
-        torch.set_num_threads(max((os.cpu_count() or 1) // workers, 1))
+        cores = os.cpu_count() or 1
+        torch.set_num_threads(max(cores // workers, 1))
     try:
         return downsample_file(source, target, options, engine)
     except UserError as error:
@@ -161,12 +189,14 @@ def process_file(source: Path, target: Path, options: Options, engine: Engine | 
     if isinstance(result, UserError):
         raise result
     seconds = time.perf_counter() - start
-    print(printable(f"{target}: {_told(result, options)}, {seconds:.1f} s"))
+    words = _told(result, options)
+    print(printable(f"{target}: {words}, {seconds:.1f} s"))
 
 
 def _told(result: "Outcome", options: Options) -> str:
     """Return the numbers of points of a file, and how they were chosen, in words."""
-    words = f"{result.kept:,} of {counted(result.number, 'point')}"
+    points = counted(result.number, "point")
+    words = f"{result.kept:,} of {points}"
     if result.dropped:
         words += f" ({result.dropped:,} more without finite coordinates left out)"
     if result.drawn is not None and result.drawn < result.number:
@@ -200,43 +230,55 @@ def process_folder(
     failures: dict[Path, UserError] = {}
     if is_total:
         jobs, failures = share_total(jobs)
-    todo = [job for job in jobs if options.overwrite or not job.target.exists()]
+    todo = jobs
+    if not options.overwrite:
+        todo = [job for job in jobs if not job.target.exists()]
     if todo:
         target.mkdir(parents=True, exist_ok=True)
         if not os.access(target, os.W_OK):
             raise UserError(f"OUT: cannot write into {target}. Give another OUT.")
-    done = dropped = 0
+    done = 0
+    dropped = 0
     results = _results(todo, workers, engine)
+    is_quiet = not sys.stdout.isatty()
     with closing(results):  # ends the processes when the user interrupts
-        for job, result in track(
-            results, "downsampling", total=len(todo), disable=not sys.stdout.isatty()
-        ):
+        for job, result in track(results, "downsampling", total=len(todo), disable=is_quiet):
             if isinstance(result, UserError):
                 failures[job.source] = result
             else:
                 done += 1
                 dropped += result.dropped
-    for source, error in sorted(failures.items()):
-        name = "" if str(source) in str(error) else f"{source}: "
-        print(as_line(f"failed: {name}{error}"), file=sys.stderr)
+    _tell_failures(failures)
     counts = {
         "failed": len(failures),
         "done": done,
         "done before": len(jobs) - len(todo),
         "skipped": len(inputs.unreadable),
     }
-    words = ", ".join(f"{number} {state}" for state, number in counts.items() if number)
+    states = [f"{count} {state}" for state, count in counts.items() if count]
+    words = ", ".join(states)
     if inputs.unreadable:
-        words += f": {' '.join(_kinds(inputs.unreadable))}"
+        kinds = " ".join(_kinds(inputs.unreadable))
+        words += f": {kinds}"
     if dropped:
         words += f"; {counted(dropped, 'point')} without finite coordinates left out"
-    print(printable(f"{counted(number, 'file')}: {words}; in {target}"))
+    files = counted(number, "file")
+    print(printable(f"{files}: {words}; in {target}"))
     return len(failures)
+
+
+def _tell_failures(failures: dict[Path, UserError]) -> None:
+    for source, error in sorted(failures.items()):
+        text = str(error)
+        if str(source) not in text:
+            text = f"{source}: {text}"
+        print(as_line(f"failed: {text}"), file=sys.stderr)
 
 
 def _kinds(paths: list[Path]) -> list[str]:
     """Return the suffixes of files, or their names where they have none."""
-    return sorted({path.suffix.lower() or path.name for path in paths})
+    kinds = {path.suffix.lower() or path.name for path in paths}
+    return sorted(kinds)
 
 
 def _results(
@@ -245,11 +287,15 @@ def _results(
     """Yield jobs and results, in the order of completion."""
     workers = min(workers, len(jobs))
     if engine is not None or workers < 2:
-        yield from ((job, attempt(*job, engine=engine)) for job in jobs)
+        for job in jobs:
+            yield job, attempt(*job, engine=engine)
         return
     # Spawned, because forking after torch has started threads can deadlock.
     with ProcessPoolExecutor(workers, get_context("spawn"), start_worker) as executor:
-        job_of = {executor.submit(attempt, *job, workers): job for job in jobs}
+        job_of = {}
+        for job in jobs:
+            future = executor.submit(attempt, *job, workers)
+            job_of[future] = job
         try:
             for future in as_completed(job_of):
                 job = job_of[future]

@@ -50,7 +50,9 @@ def keep_by_distance(
         UserError: the file is broken, has no points, or has no such columns.
     """
     file = _file(source, whole, options)
-    name = "--voxel" if options.spacing is None else "--spacing"
+    name = "--spacing"
+    if options.spacing is None:
+        name = "--voxel"
     check_unit(file.header, name, source)
     if options.chunk is not None and options.weight == CURVATURE:
         raise UserError("--weight curvature needs the whole cloud in memory: leave --chunk out.")
@@ -58,7 +60,8 @@ def keep_by_distance(
         options = replace(options, chunk=max(options.chunk, LEAST_CHUNK))
     # The header of a file is needed only where it is written.
     cloud = replace(file, header=None)
-    ranges = file.row_ranges(options.chunk or max(file.number, 1))
+    size = options.chunk or max(file.number, 1)
+    ranges = file.row_ranges(size)
     passes = Passes(cloud, ranges, options, engine)
     if options.spacing is not None:
         kept, number = passes.spaced()
@@ -68,8 +71,12 @@ def keep_by_distance(
         raise BadCloudError(f"--weight {options.weight} of {source}: all weights are 0.")
     if not len(kept.points):
         raise BadCloudError(f"{source} holds no points that could be kept.")
-    left_out = len(whole.points) if whole is not None else file.number
-    dropped = 0 if options.area else left_out - number
+    dropped = 0
+    if options.area is None:
+        number_of_all = file.number
+        if whole is not None:
+            number_of_all = len(whole.points)
+        dropped = number_of_all - number
     table = replace(kept, header=file.header)
     if options.coordinates_only:
         table = table.without_attributes()
@@ -79,11 +86,13 @@ def keep_by_distance(
 def _file(source: Path, whole: Table | None, options: Options) -> CloudFile:
     if whole is None:
         return open_cloud_file(source, options.area, options.columns)
-    return CloudFile(source, len(whole.points), partial(_rows_of, whole), whole.header)
+    parse = partial(_rows_of, whole)
+    return CloudFile(source, len(whole.points), parse, whole.header)
 
 
 def _rows_of(table: Table, path: Path, rows: range) -> Table:
-    return replace(table.take(np.arange(rows.start, rows.stop)), header=None)
+    places = np.arange(rows.start, rows.stop)
+    return replace(table.take(places), header=None)
 
 
 Weight = NDArray[np.float64] | None
@@ -166,12 +175,15 @@ class Candidates(NamedTuple):
         """Return the candidates that come first, each place once, in the order of the file."""
         if most is None or len(self.rows) <= most:
             return self
-        order = priority_order(self.used, priorities(self.used, seed), self.weight)
+        hashes = priorities(self.used, seed)
+        order = priority_order(self.used, hashes, self.weight)
         ordered = self.used[order]
         is_new = np.ones(len(order), bool)
-        is_new[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
+        differs = ordered[1:] != ordered[:-1]
+        is_new[1:] = differs.any(axis=1)
         order = order[is_new]
-        return self.take(np.sort(order[:most]), self.is_cut or len(order) > most)
+        is_cut = self.is_cut or len(order) > most
+        return self.take(np.sort(order[:most]), is_cut)
 
     def merge(self, other: "Candidates") -> "Candidates":
         """Join the candidates of two ranges, of which the other one comes later."""
@@ -192,14 +204,18 @@ class Candidates(NamedTuple):
 
 
 def _candidates(
-    cloud: CloudFile, options: Options, kept: NDArray[np.float64] | None, rows: range
+    cloud: CloudFile,
+    options: Options,
+    kept: NDArray[np.float64] | None,
+    rows: range,
 ) -> Candidates:
     assert options.spacing is not None
     part = _read(cloud, options, rows)
     used = in_space(part.table, options.space, cloud.path)
     found = Candidates(part.table, part.rows, used, part.weight, part.number)
     if kept is not None:
-        found = found.take(uncovered(used, kept, options.spacing), is_cut=False)
+        rows_left = uncovered(used, kept, options.spacing)
+        found = found.take(rows_left, is_cut=False)
     return found.first(options.chunk, options.seed)
 
 
@@ -252,7 +268,8 @@ class Found(NamedTuple):
         if self.weight is not None:
             lightness = -self.weight
         # The last key of a lexsort comes first.
-        order = np.lexsort((self.rows, z, y, x, self.distance, lightness, self.voxel))
+        keys = (self.rows, z, y, x, self.distance, lightness, self.voxel)
+        order = np.lexsort(keys)
         ordered = self.voxel[order]
         is_first = np.ones(len(order), bool)
         is_first[1:] = ordered[1:] != ordered[:-1]
@@ -300,11 +317,14 @@ def _column_sums(
 ) -> Sums:
     assert options.voxel is not None
     table = _read(cloud, options, rows).table
-    return sum_in_voxels(table.points, options.voxel, voxels, values_of(table, names), scales)
+    values = values_of(table, names)
+    return sum_in_voxels(table.points, options.voxel, voxels, values, scales)
 
 
 def _add(left: Sums, right: Sums) -> Sums:
-    return Sums(left.high + right.high, left.low + right.low, left.wrong + right.wrong)
+    high = left.high + right.high
+    low = left.low + right.low
+    return Sums(high, low, wrong=left.wrong + right.wrong)
 
 
 class Passes(NamedTuple):
@@ -329,26 +349,41 @@ class Passes(NamedTuple):
 
     def spaced(self) -> tuple[Table, int]:
         """Return the points that a spacing keeps, and how many finite points the file has."""
-        assert self.options.spacing is not None
+        spacing = self.options.spacing
+        assert spacing is not None
         kept: Candidates | None = None
         number = 0
         is_cut = True
         while is_cut:
-            used = None if kept is None else kept.used
-            drawn: Candidates | None = None
-            for part in self.over("spacing", _candidates, used):
-                drawn = part if drawn is None else drawn.merge(part)
-                drawn = drawn.first(self.options.chunk, self.options.seed)
+            used = None
+            if kept is not None:
+                used = kept.used
+            drawn = self._drawn(used)
             if drawn is None:
                 break
             is_cut = drawn.is_cut
-            rows = keep_spaced(drawn.used, self.options.spacing, self.options.seed, drawn.weight)
-            new = drawn.take(rows, is_cut)
             number = drawn.number
-            kept = new if kept is None else kept.merge(new)
+            rows = keep_spaced(drawn.used, spacing, self.options.seed, drawn.weight)
+            new = drawn.take(rows, is_cut)
+            if kept is None:
+                kept = new
+            else:
+                kept = kept.merge(new)
         if kept is None:
             return Table(np.empty((0, 3))), 0
-        return kept.table.take(kept.rows.argsort()), number
+        in_order = kept.rows.argsort()
+        return kept.table.take(in_order), number
+
+    def _drawn(self, used: NDArray[np.float64] | None) -> Candidates | None:
+        """Return the first candidates of all parts that kept points leave; None without parts."""
+        drawn: Candidates | None = None
+        for part in self.over("spacing", _candidates, used):
+            if drawn is None:
+                drawn = part
+            else:
+                drawn = drawn.merge(part)
+            drawn = drawn.first(self.options.chunk, self.options.seed)
+        return drawn
 
     def in_voxels(self) -> tuple[Table, int]:
         """Return one point of every voxel, and how many finite points the file has."""
@@ -362,10 +397,12 @@ class Passes(NamedTuple):
                 voxels = voxels.merge(occupied_in_part)
         if voxels is None or not len(voxels.counts):
             return Table(np.empty((0, 3))), number
-        found: Found = reduce(Found.merge, self.over("nearest", _found, voxels))
+        parts = self.over("nearest", _found, voxels)
+        found: Found = reduce(Found.merge, parts)
         if self.options.readout == "generated":
             return self._means(voxels, found), number
-        return found.table.take(found.rows.argsort()), number
+        in_order = found.rows.argsort()
+        return found.table.take(in_order), number
 
     def _means(self, voxels: Voxels, found: Found) -> Table:
         """Return the means of all voxels; columns of names are those of the nearest points."""
@@ -374,7 +411,8 @@ class Passes(NamedTuple):
         names = averaged(nearest)
         columns = dict(nearest.columns)
         if names:
-            largest: NDArray[np.float64] = reduce(np.maximum, self.over("scale", _largest, names))
+            parts = self.over("scale", _largest, names)
+            largest: NDArray[np.float64] = reduce(np.maximum, parts)
             scales = scales_for(largest)
             work = self.over("means", _column_sums, names, voxels, scales)
             sums: Sums = reduce(_add, work)
@@ -382,7 +420,8 @@ class Passes(NamedTuple):
             for name, values in zip(names, means.T, strict=True):
                 columns[name] = as_stored(values, nearest.columns[name])
         renormalise(columns)
-        is_alone = (voxels.counts == 1)[:, None]
-        points = np.where(is_alone, nearest.points, voxels.means(self.options.voxel))
+        is_alone = voxels.counts == 1
+        means_of_voxels = voxels.means(self.options.voxel)
+        points = np.where(is_alone[:, None], nearest.points, means_of_voxels)
         form = replace(nearest.form, coordinates=None)
         return replace(nearest, points=points, columns=columns, form=form)

@@ -44,8 +44,9 @@ class Nearest(NamedTuple):
         number = len(is_nearer)
         rows = np.arange(number)
         rows[is_nearer] += number  # the other table's rows come after this one's
-        table = join_tables([self.table, other.table]).take(rows)
-        return Nearest(np.minimum(self.distance, other.distance), table)
+        both = join_tables([self.table, other.table])
+        distance = np.minimum(self.distance, other.distance)
+        return Nearest(distance, both.take(rows))
 
 
 class Outcome(NamedTuple):
@@ -81,13 +82,16 @@ def sample_by_chunks(
     assert options.chunk is not None
     _check_streams(sampler, options)
     file = open_cloud_file(source, options.area, options.columns)
-    cloud, row_ranges = replace(file, header=None), file.row_ranges(options.chunk)
+    cloud = replace(file, header=None)
+    row_ranges = file.row_ranges(options.chunk)
 
     def over(title: str, function: Callable[..., Any], *common: Any) -> Iterable[Any]:
-        results = engine.map(title, partial(function, cloud, *common), row_ranges)
+        work = partial(function, cloud, *common)
+        results = engine.map(title, work, row_ranges)
         return (result for result in results if result is not None)
 
-    number, summed = 0, np.zeros(3)
+    number = 0
+    summed = np.zeros(3)
     for count, part in over("centre", _count_and_sum):
         number += count
         summed += part
@@ -95,7 +99,8 @@ def sample_by_chunks(
     sampler.check_m(m)
     check_size(source, number, m, options.area)
     centre = summed / number
-    sphere = UnitSphere(centre, max(over("radius", _radius, centre)) or 1.0)
+    radius = max(over("radius", _radius, centre)) or 1.0
+    sphere = UnitSphere(centre, radius)
     seen = Seen(sphere, sampler.point_channels)
 
     def over_seen(title: str, function: Callable[[Tensor], Any]) -> Iterable[Any]:
@@ -106,16 +111,23 @@ def sample_by_chunks(
     else:
         generated = _generate_at_once(sampler, m, number, over_seen)
     places = coordinates(generated)
-    outcome = Outcome(m, number, 0 if options.area else file.number - number)
+    dropped = 0
+    if options.area is None:
+        dropped = file.number - number
+    outcome = Outcome(m, number, dropped)
     if options.readout == "generated":
         columns: Mapping[str, Column] = {}
         if sampler.point_channels and not options.coordinates_only:
-            some = cloud.read(row_ranges[0])
-            columns = generated_columns(some, sampler.point_channels, generated[:, 3:])
+            example = cloud.read(row_ranges[0])
+            channels = generated[:, 3:]
+            columns = generated_columns(example, sampler.point_channels, channels)
         return Table(sphere.restore(places), columns, file.header), outcome
-    matched: Nearest = reduce(Nearest.merge, over("matching", _nearest, sphere, places))
+    parts = over("matching", _nearest, sphere, places)
+    matched: Nearest = reduce(Nearest.merge, parts)
     kept = replace(matched.table, header=file.header)
-    return kept.without_attributes() if options.coordinates_only else kept, outcome
+    if options.coordinates_only:
+        kept = kept.without_attributes()
+    return kept, outcome
 
 
 OverSeen = Callable[[str, Callable[[Tensor], Any]], Iterable[Any]]
@@ -135,7 +147,8 @@ def _generate_by_parts(sampler: Sampler, m: int, over_seen: OverSeen) -> Tensor:
 def _generate_at_once(sampler: Sampler, m: int, number: int, over_seen: OverSeen) -> Tensor:
     """Return the generated points ``(m, 3 + C)``; what the sampler sees of all points is kept."""
     width = 3 + len(sampler.point_channels)
-    points = next(sampler.parameters()).new_empty(number, width)
+    weight = next(sampler.parameters())
+    points = weight.new_empty(number, width)
     first = 0
     for part in over_seen("reading", _as_seen):
         points[first : first + len(part)] = part
@@ -170,11 +183,16 @@ def count_by_class(source: Path, options: Options, engine: Engine) -> dict[int, 
 def _count_classes(cloud: CloudFile, options: Options, rows: range) -> dict[int, int]:
     assert options.strata is not None
     table = cloud.read(rows)
-    return count_classes(options.strata.classes(table, cloud.path)) if len(table.points) else {}
+    if not len(table.points):
+        return {}
+    return count_classes(options.strata.classes(table, cloud.path))
 
 
 def draw(
-    source: Path, options: Options, engine: Engine, quotas: Mapping[int, int] | None = None
+    source: Path,
+    options: Options,
+    engine: Engine,
+    quotas: Mapping[int, int] | None = None,
 ) -> tuple[Table, int, int]:
     """Draw random points of a file without reading it as a whole.
 
@@ -198,10 +216,11 @@ def draw(
     function = partial(_draw, replace(file, header=None), options, quotas)
     drawn = Drawn(np.empty(0), join_tables([]), 0)
     for part in engine.map("drawing", function, file.row_ranges(PART)):
-        keys = np.concatenate([drawn.keys, part.keys])
-        both = Drawn(keys, join_tables([drawn.table, part.table]), drawn.number + part.number)
+        both = drawn.merge(part)
         drawn = both.lowest(source, options, quotas)
-    dropped = 0 if options.area else file.number - drawn.number
+    dropped = 0
+    if options.area is None:
+        dropped = file.number - drawn.number
     return replace(drawn.table, header=file.header), drawn.number, dropped
 
 
@@ -211,6 +230,12 @@ class Drawn(NamedTuple):
     keys: NDArray[np.float64]
     table: Table
     number: int
+
+    def merge(self, other: "Drawn") -> "Drawn":
+        """Return the rows of both."""
+        keys = np.concatenate([self.keys, other.keys])
+        table = join_tables([self.table, other.table])
+        return Drawn(keys, table, self.number + other.number)
 
     def lowest(self, path: Path, options: Options, quotas: Mapping[int, int] | None) -> "Drawn":
         """Keep the points with the lowest keys: ``options.chunk``, or as many of every class."""
@@ -224,8 +249,10 @@ class Drawn(NamedTuple):
         by_class = []
         for name, quota in quotas.items():
             members = np.flatnonzero(classes == name)
-            by_class.append(members[_lowest(self.keys[members], quota)])
-        return self.take(np.sort(np.concatenate(by_class)))
+            chosen = _lowest(self.keys[members], quota)
+            by_class.append(members[chosen])
+        rows = np.concatenate(by_class)
+        return self.take(np.sort(rows))
 
     def take(self, rows: NDArray[np.int64]) -> "Drawn":
         """Keep some of the points."""
@@ -238,18 +265,24 @@ def _lowest(keys: NDArray[np.float64], most: int) -> NDArray[np.int64]:
     """Return the rows of the lowest keys, ascending."""
     if len(keys) <= most:
         return np.arange(len(keys))
-    return np.sort(keys.argpartition(most)[:most])
+    lowest = keys.argpartition(most)[:most]
+    return np.sort(lowest)
 
 
 def _draw(
-    cloud: CloudFile, options: Options, quotas: Mapping[int, int] | None, rows: range
+    cloud: CloudFile,
+    options: Options,
+    quotas: Mapping[int, int] | None,
+    rows: range,
 ) -> Drawn:
     table = cloud.read(rows)
     check_coordinates(cloud.path, table.points)
     if not options.needs_columns:
         table = table.without_attributes()
-    keys = np.random.default_rng([options.seed, rows.start]).random(len(table.points))
-    return Drawn(keys, table, len(keys)).lowest(cloud.path, options, quotas)
+    rng = np.random.default_rng([options.seed, rows.start])
+    keys = rng.random(len(table.points))
+    drawn = Drawn(keys, table, len(keys))
+    return drawn.lowest(cloud.path, options, quotas)
 
 
 def _count_and_sum(cloud: CloudFile, rows: range) -> tuple[int, NDArray[np.float64]]:
@@ -259,7 +292,8 @@ def _count_and_sum(cloud: CloudFile, rows: range) -> tuple[int, NDArray[np.float
 
 
 def _radius(cloud: CloudFile, centre: NDArray[np.float64], rows: range) -> float:
-    return largest_distance(cloud.read(rows).points, centre)
+    points = cloud.read(rows).points
+    return largest_distance(points, centre)
 
 
 class Seen(NamedTuple):
@@ -290,5 +324,7 @@ def _nearest(
     table = cloud.read(rows)
     if not len(table.points):
         return None
-    distance, row = nearest(generated[None], sphere.normalise(table.points)[None])
-    return Nearest(distance[0].numpy(), table.take(row[0].numpy()))
+    places = sphere.normalise(table.points)
+    distance, row = nearest(generated[None], places[None])
+    kept = table.take(row[0].numpy())
+    return Nearest(distance[0].numpy(), kept)

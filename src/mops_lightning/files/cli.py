@@ -53,7 +53,8 @@ DRAWN = ("draws", "crops", "points")
 def propagate(arguments: list[str], prog: str = "mops-lightning propagate") -> None:
     """Carry columns of one file to another; arguments as for ``downsample``."""
     with one_line_endings(prog):
-        _propagate(parsed(arguments, prog, PROPAGATE, _propagate_arguments))
+        chosen = parsed(arguments, prog, PROPAGATE, _propagate_arguments)
+        _propagate(chosen)
 
 
 def _propagate_arguments(add: Add) -> None:
@@ -91,23 +92,37 @@ def _propagate(chosen: argparse.Namespace) -> None:
     from mops_lightning.data.formats.registry import PART_WRITERS
     from mops_lightning.files.propagate import propagate_file
 
-    big, target = chosen.big, chosen.target
+    big = chosen.big
+    target = chosen.target
     check_is_file(big)
     if target is None:
-        suffix = big.suffix if big.suffix.lower() in PART_WRITERS else ".ply"
+        suffix = ".ply"
+        if big.suffix.lower() in PART_WRITERS:
+            suffix = big.suffix
         stem = big.stem.removesuffix(".copc")  # a COPC file would sort the points
         target = big.with_name(f"{stem}_propagated{suffix}")
     if target.suffix.lower() not in PART_WRITERS:
-        raise UserError(f"OUT must end in {', '.join(PART_WRITERS)}, got {target}.")
+        endings = ", ".join(PART_WRITERS)
+        raise UserError(f"OUT must end in {endings}, got {target}.")
     if realpath(target) in (realpath(big), realpath(chosen.small)):
         raise UserError(f"OUT must differ from SMALL and BIG, got {target}.")
     if target.exists() and not chosen.overwrite:
         raise UserError(f"{target} exists. Give another OUT, or --overwrite.")
     remove_temporary(target.parent, below=False)
     columns = columns_of(chosen)
-    number = propagate_file(chosen.small, big, target, chosen.field, chosen.k, chosen.mean, columns)
-    names, seconds = ", ".join(chosen.field), time.perf_counter() - start
-    print(printable(f"{target}: {names} of {counted(number, 'point')}, {seconds:.1f} s"))
+    number = propagate_file(
+        chosen.small,
+        big,
+        target,
+        chosen.field,
+        chosen.k,
+        chosen.mean,
+        columns,
+    )
+    names = ", ".join(chosen.field)
+    points = counted(number, "point")
+    seconds = time.perf_counter() - start
+    print(printable(f"{target}: {names} of {points}, {seconds:.1f} s"))
 
 
 def compare(arguments: list[str], prog: str = "mops-lightning compare") -> None:
@@ -192,9 +207,13 @@ def _compare(chosen: argparse.Namespace) -> None:
     if not is_icp:
         _refuse(chosen, (*ONLY_ICP, *DRAWN), "--task icp")
     check_out(chosen.out, chosen.overwrite)
-    table = compare_icp(chosen) if is_icp else _compare_coverage(chosen)
+    if is_icp:
+        table = compare_icp(chosen)
+    else:
+        table = _compare_coverage(chosen)
     print(table)
-    print(f"files in {chosen.out}/: {', '.join(COMPARED)}")
+    files = ", ".join(COMPARED)
+    print(f"files in {chosen.out}/: {files}")
 
 
 def _refuse(chosen: argparse.Namespace, options: Sequence[str], of: str) -> None:
@@ -205,7 +224,8 @@ def _refuse(chosen: argparse.Namespace, options: Sequence[str], of: str) -> None
     """
     for name in options:
         if getattr(chosen, name) is not None:
-            raise UserError(f"--{name.replace('_', '-')} is for {of}.")
+            option = name.replace("_", "-")
+            raise UserError(f"--{option} is for {of}.")
 
 
 def _compare_coverage(chosen: argparse.Namespace) -> str:
@@ -214,23 +234,24 @@ def _compare_coverage(chosen: argparse.Namespace) -> str:
     names = chosen.methods or list(UNTRAINED)
     for name in names:
         if name not in UNTRAINED:
-            raise UserError(f"--methods: unknown {name!r}.{did_you_mean(name, UNTRAINED)}")
+            hint = did_you_mean(name, UNTRAINED)
+            raise UserError(f"--methods: unknown {name!r}.{hint}")
     columns = columns_of(chosen)
-    if columns and not any(path.suffix.lower() == ".bin" for path in chosen.files):
+    suffixes = {path.suffix.lower() for path in chosen.files}
+    if columns and ".bin" not in suffixes:
         raise UserError("--columns is for .bin files, got none.")
     from mops_lightning.files import compare as comparison
     from mops_lightning.files.downsample import load_sampler
 
-    by_size = {
-        m: comparison.options_by_method(m, names, weights, chosen.tile, chosen.seed)
-        for m in chosen.m
-    }
+    by_size = {}
+    for m in chosen.m:
+        by_size[m] = comparison.options_by_method(m, names, weights, chosen.tile, chosen.seed)
     for methods in by_size.values():
         for options in methods.values():
             load_sampler(options)  # reports its mistakes before any file is read
-    results = [
-        comparison.compare_file(path, m, methods, chosen.seed, columns)
-        for path in chosen.files
-        for m, methods in by_size.items()
-    ]
+    results = []
+    for path in chosen.files:
+        for m, methods in by_size.items():
+            compared = comparison.compare_file(path, m, methods, chosen.seed, columns)
+            results.append(compared)
     return comparison.write_comparison(results, chosen.out)

@@ -7,9 +7,20 @@ from mops_lightning.data.features import STORED_NORMALS
 from mops_lightning.data.formats.table import Column, Table
 
 AVERAGED = {
-    "red", "green", "blue", "nir", "alpha", "intensity", "r", "g", "b", "a",
-    "diffuse_red", "diffuse_green", "diffuse_blue",
-}  # fmt: skip
+    "red",
+    "green",
+    "blue",
+    "nir",
+    "alpha",
+    "intensity",
+    "r",
+    "g",
+    "b",
+    "a",
+    "diffuse_red",
+    "diffuse_green",
+    "diffuse_blue",
+}
 """Columns of whole numbers that are quantities; others are names, of which there is no mean."""
 
 PACKED = {"rgb", "rgba"}
@@ -18,20 +29,22 @@ PACKED = {"rgb", "rgba"}
 
 def averaged(table: Table) -> list[str]:
     """Return the names of columns that have a mean."""
-    return [
-        name
-        for name, column in table.columns.items()
-        if column.ndim == 1
-        and name.lower() not in PACKED
-        and (column.dtype.kind == "f" or name.lower() in AVERAGED)
-    ]
+    return [name for name, column in table.columns.items() if _is_averaged(name, column)]
+
+
+def _is_averaged(name: str, column: Column) -> bool:
+    plain = name.lower()
+    if column.ndim != 1 or plain in PACKED:
+        return False
+    return column.dtype.kind == "f" or plain in AVERAGED
 
 
 def values_of(table: Table, names: list[str]) -> NDArray[np.float64]:
     """Return the values ``(N, names)`` of columns."""
     if not names:
         return np.empty((len(table.points), 0))
-    return np.stack([table.columns[name].astype(np.float64) for name in names], axis=1)
+    columns = [table.columns[name].astype(np.float64) for name in names]
+    return np.stack(columns, axis=1)
 
 
 def as_stored(means: NDArray[np.float64], column: Column) -> Column:
@@ -45,8 +58,10 @@ def renormalise(columns: dict[str, Column]) -> None:
     """Scale normals to length 1; those that cancel out stay 0."""
     for names in STORED_NORMALS:
         if all(name in columns for name in names):
-            normals = np.stack([columns[name].astype(np.float64) for name in names], axis=1)
+            axes = [columns[name].astype(np.float64) for name in names]
+            normals = np.stack(axes, axis=1)
             lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-            normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
+            zeros = np.zeros_like(normals)
+            normals = np.divide(normals, lengths, out=zeros, where=lengths > 0)
             for name, values in zip(names, normals.T, strict=True):
                 columns[name] = values.astype(columns[name].dtype)

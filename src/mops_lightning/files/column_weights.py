@@ -37,5 +37,5 @@ def weights_of(table: Table, field: str, source: Path) -> NDArray[np.float64]:
     if field == "opacity" and table.columns.keys() >= SPLAT:
         values = expit(values)
     name = f"--weight {field} of {source}"
-    weight: NDArray[np.float64] = check_weight(values, values.shape, name).numpy()
-    return weight
+    weight = check_weight(values, values.shape, name)
+    return weight.numpy()

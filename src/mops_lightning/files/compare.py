@@ -41,11 +41,16 @@ Rows = NDArray[np.int64]
 TRAINED = "trained"
 
 COLUMNS = {
-    "chamfer": ".4g", "hausdorff": ".4g", "density": ".2f", "ground": ".4g", "seconds": ".2f"
-}  # fmt: skip
+    "chamfer": ".4g",
+    "hausdorff": ".4g",
+    "density": ".2f",
+    "ground": ".4g",
+    "seconds": ".2f",
+}
 """The measures, and their formats."""
 
-CLASSES, GROUND = "classification", 2
+CLASSES = "classification"
+GROUND = 2
 """The column with the classes of airborne scans, and the class of the ground (LAS 1.4)."""
 
 MEANINGS = [
@@ -106,7 +111,11 @@ class FileResult:
 
 
 def options_by_method(
-    m: int, names: Sequence[str], weights: str | None, tile: int | None, seed: int
+    m: int,
+    names: Sequence[str],
+    weights: str | None,
+    tile: int | None,
+    seed: int,
 ) -> dict[str, Options]:
     """Return the options of every method.
 
@@ -120,7 +129,10 @@ def options_by_method(
     Raises:
         UserError: a value is out of range.
     """
-    options = {name: Options(m, method=name, seed=seed) for name in UNTRAINED if name in names}
+    options = {}
+    for name in UNTRAINED:
+        if name in names:
+            options[name] = Options(m, method=name, seed=seed)
     if weights is not None:
         options[TRAINED] = Options(m, weights, seed=seed, tile=tile)
     return options
@@ -145,18 +157,27 @@ def compare_file(
     Raises:
         UserError: the file holds no usable cloud, or too few points.
     """
-    table = read(path, max(SURFACE, 8 * m), seed, columns=columns).finite()
-    points, ground = table.points, table.columns.get(CLASSES, np.empty(0)) == GROUND
+    surface = max(SURFACE, 8 * m)
+    table = read(path, surface, seed, columns=columns).finite()
+    points = table.points
+    classes = table.columns.get(CLASSES, np.empty(0))
+    is_ground = classes == GROUND
     check_size(path, len(points), m)
     results = []
     for name, options in methods.items():
-        channels = channels_for(table, load_sampler(options).point_channels, path)
+        sampler = load_sampler(options)
+        channels = channels_for(table, sampler.point_channels, path)
         _warm_up(path, table, m, options, channels)
         start = time.perf_counter()
         rows = _sample(path, table, m, options, channels)
         seconds = time.perf_counter() - start
-        error = ground_error(points[ground], points[rows[ground[rows]]]) if ground.any() else None
-        results.append(Result(name, rows, *coverage(points, points[rows]), error, seconds))
+        kept = points[rows]
+        error = None
+        if is_ground.any():
+            is_kept_ground = is_ground[rows]
+            error = ground_error(points[is_ground], kept[is_kept_ground])
+        chamfer, hausdorff, density = coverage(points, kept)
+        results.append(Result(name, rows, chamfer, hausdorff, density, error, seconds))
     return FileResult(path, points, m, results)
 
 
@@ -170,7 +191,8 @@ def coverage(points: Points, kept: Points) -> tuple[float, float, float]:
     neighbours: Any = cKDTree(kept).query(points)
     distance, nearest = neighbours
     members = np.bincount(nearest, minlength=len(kept))
-    return float(distance.mean()), float(distance.max()), float(members.std() / members.mean())
+    density = members.std() / members.mean()
+    return float(distance.mean()), float(distance.max()), float(density)
 
 
 def ground_error(ground: Points, kept: Points) -> float:
@@ -189,27 +211,34 @@ def ground_error(ground: Points, kept: Points) -> float:
     if not len(kept):
         return float("nan")
     middle = ground[:, :2].mean(0)  # float64 has too few digits for products of map coordinates
-    places, known = ground[:, :2] - middle, kept[:, :2] - middle
-    nearest: Any = cKDTree(known).query(places)
-    height = kept[nearest[1], 2]
+    places = ground[:, :2] - middle
+    known = kept[:, :2] - middle
+    _, nearest = cKDTree(known).query(places)
+    height = kept[nearest, 2]
     with suppress(QhullError, ValueError):  # fewer than three points, or all on one line
         surface = LinearNDInterpolator(known, kept[:, 2])(places)
         height = np.where(np.isnan(surface), height, surface)
-    return float(np.sqrt(np.square(height - ground[:, 2]).mean()))
+    errors = height - ground[:, 2]
+    return float(np.sqrt(np.square(errors).mean()))
 
 
 def _warm_up(path: Path, table: Table, m: int, options: Options, channels: Tensor | None) -> None:
     """Sample a few points, so that imports and compilation are in no method's time."""
-    few = np.random.default_rng(0).permutation(len(table.points))[: 2 * m]
+    order = np.random.default_rng(0).permutation(len(table.points))
+    few = order[: 2 * m]
     # A part may be unusable where the whole is not, such as one of equal points.
     with suppress(UserError):
-        of_few = None if channels is None else channels[torch.from_numpy(few)]
+        of_few = None
+        if channels is not None:
+            of_few = channels[torch.from_numpy(few)]
         _sample(path, table.take(few), m, options, of_few)
 
 
 def _sample(path: Path, table: Table, m: int, options: Options, channels: Tensor | None) -> Rows:
     sampler = load_sampler(options)
-    normals = normals_of(table) if isinstance(sampler, ByNormals) else None
+    normals = None
+    if isinstance(sampler, ByNormals):
+        normals = normals_of(table)
     rows, _ = sample_cloud(
         table.points, sampler, m, options, path, channels=channels, normals=normals
     )
@@ -225,29 +254,40 @@ def write_comparison(results: Sequence[FileResult], folder: Path) -> str:
     if any("ground" in grid.head for grid in grids):
         meanings.append(MEANING_OF_GROUND)
     page = render("compare", grids, clouds, meanings, "How to read this", choice="File")
-    for name, content in zip(COMPARED, (_csv(results), page), strict=True):
+    contents = (_csv(results), page)
+    for name, content in zip(COMPARED, contents, strict=True):
         with atomic_write(folder / name) as temporary:
             temporary.write_text(content, encoding="utf-8")
     return markdown(grids, meanings)
 
 
 def _grid(compared: FileResult) -> Grid:
+    first = compared.results[0]
     title = f"{compared.path.name}: {compared.m:,} of {len(compared.points):,} points"
-    forms = {n: f for n, f in COLUMNS.items() if getattr(compared.results[0], n) is not None}
-    rows = [
-        [result.method, *(format(getattr(result, name), form) for name, form in forms.items())]
-        for result in compared.results
-    ]
+    forms = {}
+    for name, form in COLUMNS.items():
+        if getattr(first, name) is not None:
+            forms[name] = form
+    rows = []
+    for result in compared.results:
+        cells = [format(getattr(result, name), form) for name, form in forms.items()]
+        rows.append([result.method, *cells])
     return Grid(title, ["method", *forms], rows)
 
 
 def _csv(results: Sequence[FileResult]) -> str:
-    rows = [
-        {"file": one.path, "points": len(one.points), "m": one.m, "method": result.method}
-        | {name: getattr(result, name) for name in COLUMNS}
-        for one in results
-        for result in one.results
-    ]
+    rows = []
+    for compared in results:
+        for result in compared.results:
+            row = {
+                "file": compared.path,
+                "points": len(compared.points),
+                "m": compared.m,
+                "method": result.method,
+            }
+            for name in COLUMNS:
+                row[name] = getattr(result, name)
+            rows.append(row)
     return pd.DataFrame(rows).to_csv(index=False, lineterminator="\n")
 
 
@@ -255,13 +295,17 @@ def _clouds(compared: FileResult) -> dict[str, Any]:
     """Return a file's clouds for the page, in the unit sphere."""
     points = compared.points
     centred = points - points.mean(0)
-    turned = centred[:, [0, 2, 1]] * [1, 1, -1] / (np.abs(centred).max() or 1.0)  # z up to y up
-    sets = {INPUT: thinned(turned), **{r.method: turned[r.rows] for r in compared.results}}
+    largest = np.abs(centred).max() or 1.0
+    turned = centred[:, [0, 2, 1]] * [1, 1, -1] / largest  # z up to y up
+    sets = {INPUT: thinned(turned)}
+    for result in compared.results:
+        sets[result.method] = turned[result.rows]
+    points_of_sets = {name: [cloud.round(3).tolist()] for name, cloud in sets.items()}
     shown = (INPUT, compared.results[-1].method)  # the trained sampler, if there is one
     return {
         "name": f"{compared.path.name}, {compared.m:,} points",
         "titles": [compared.path.stem],
-        "points": {name: [cloud.round(3).tolist()] for name, cloud in sets.items()},
+        "points": points_of_sets,
         "colours": {INPUT: "lightgrey"},  # the page chooses the others
         "hidden": [name for name in sets if name not in shown],
     }

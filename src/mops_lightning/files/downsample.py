@@ -98,11 +98,14 @@ def _check_size(sampler: Sampler, options: Options, m: int | None) -> None:
         raise UserError(
             f"--m: {options.weights} holds the best method of every number of points. Give --m."
         )
-    if m is None or m == sampler.m or (m < sampler.m and sampler.flexible):
+    is_smaller = m is not None and m < sampler.m
+    if m is None or m == sampler.m or (is_smaller and sampler.flexible):
         return
-    allowed, advice = f"{sampler.m}", f"Give --m {sampler.m}"
+    allowed = f"{sampler.m}"
+    advice = f"Give --m {sampler.m}"
     if sampler.flexible:
-        allowed, advice = f"up to {sampler.m}", f"Give --m {sampler.m} or less"
+        allowed = f"up to {sampler.m}"
+        advice = f"Give --m {sampler.m} or less"
     raise UserError(
         f"--m: {options.weights} was trained for {allowed} points, got {m}. {advice}, or train "
         f"with m={m}."
@@ -139,7 +142,7 @@ def downsample_file(
 def _sample_whole(source: Path, options: Options, engine: Engine) -> tuple[Table, Outcome]:
     """Read a file as a whole, keep a part of its points, and write their map."""
     surface = options.surface or _surface(options)
-    whole = read(source, surface, options.seed, options.area, options.columns, options.vertices)
+    whole = _read(source, surface, options)
     if options.is_by_distance:
         table, outcome = keep_by_distance(source, whole, options, engine)
     else:
@@ -147,13 +150,18 @@ def _sample_whole(source: Path, options: Options, engine: Engine) -> tuple[Table
         number = len(finite.points)
         counts = None
         if options.strata is not None:
-            counts = count_classes(options.strata.classes(finite, source))
+            classes = options.strata.classes(finite, source)
+            counts = count_classes(classes)
         m = _number(options, number)
         table = _sample_table(source, finite, m, options, counts)
         outcome = Outcome(m, number, len(whole.points) - number)
     if options.map is not None:
         _write_map(options.map, whole, table, options)
     return table, outcome
+
+
+def _read(source: Path, surface: int, options: Options) -> Table:
+    return read(source, surface, options.seed, options.area, options.columns, options.vertices)
 
 
 def _write_map(path: Path, whole: Table, kept: Table, options: Options) -> None:
@@ -179,10 +187,12 @@ def count_points(source: Path, options: Options) -> int:
     try:
         file = open_cloud_file(source, options.area, options.columns)
     except WholeOnlyError:
-        surface = options.surface or SURFACE
-        table = read(source, surface, options.seed, options.area, options.columns, options.vertices)
+        table = _read(source, options.surface or SURFACE, options)
         return len(table.finite().points)
-    return sum(len(file.read(rows).points) for rows in file.row_ranges(PART))
+    number = 0
+    for rows in file.row_ranges(PART):
+        number += len(file.read(rows).points)
+    return number
 
 
 def _surface(options: Options) -> int:
@@ -194,20 +204,24 @@ def _surface(options: Options) -> int:
 
 def _number(options: Options, points: int) -> int:
     """Return how many of a file's points to keep."""
-    trained = 1 if options.m is not None else load_sampler(options).m
+    trained = 1
+    if options.m is None:
+        trained = load_sampler(options).m
     return options.number(trained, points)
 
 
 def _sample_drawn(source: Path, options: Options, engine: Engine) -> tuple[Table, Outcome]:
     """Draw random points of a file, and sample these."""
     assert options.chunk is not None
-    counts = quotas = None
+    counts = None
+    quotas = None
     if options.strata is not None:
         counts = count_by_class(source, options, engine)
-        m = _number(options, sum(counts.values()))
+        total = sum(counts.values())
+        m = _number(options, total)
         options.check_chunk(m)
-        check_size(source, sum(counts.values()), m, options.area)
-        quotas = options.strata.numbers(counts, min(options.chunk, sum(counts.values())))
+        check_size(source, total, m, options.area)
+        quotas = options.strata.numbers(counts, min(options.chunk, total))
         for name, number in options.strata.numbers(counts, m).items():
             quotas[name] = max(quotas[name], number)
     drawn, number, dropped = draw(source, options, engine, quotas)
@@ -218,7 +232,11 @@ def _sample_drawn(source: Path, options: Options, engine: Engine) -> tuple[Table
 
 
 def _sample_table(
-    source: Path, finite: Table, m: int, options: Options, counts: Mapping[int, int] | None
+    source: Path,
+    finite: Table,
+    m: int,
+    options: Options,
+    counts: Mapping[int, int] | None,
 ) -> Table:
     """Sample the finite points of a file, or some of them; without those of weight 0.
 
@@ -232,7 +250,8 @@ def _sample_table(
     check_size(source, len(finite.points), m, options.area)
     channels = None
     if options.weights is not None:
-        channels = channels_for(finite, load_sampler(options).point_channels, source)
+        sampler = load_sampler(options)
+        channels = channels_for(finite, sampler.point_channels, source)
     if options.strata is None or counts is None:
         rows, generated = _rows(source, finite, m, options, channels)
         if rows is None:
@@ -244,11 +263,18 @@ def _sample_table(
     for name, number in options.strata.numbers(counts, m).items():
         if number:
             members = np.flatnonzero(classes == name)
-            of_members = None if channels is None else channels[torch.from_numpy(members)]
+            of_members = _rows_of_channels(channels, members)
             chosen, _ = _rows(source, finite.take(members), number, options, of_members)
             assert chosen is not None  # classes keep input points
             by_class.append(members[chosen])
-    return _kept(finite, np.sort(np.concatenate(by_class)), options)
+    kept = np.concatenate(by_class)
+    return _kept(finite, np.sort(kept), options)
+
+
+def _rows_of_channels(channels: Tensor | None, rows: NDArray[np.int64]) -> Tensor | None:
+    if channels is None:
+        return None
+    return channels[torch.from_numpy(rows)]
 
 
 def _generated_table(table: Table, generated: Generated, options: Options) -> Table:
@@ -261,7 +287,9 @@ def _generated_table(table: Table, generated: Generated, options: Options) -> Ta
 
 def _kept(table: Table, rows: NDArray[np.int64], options: Options) -> Table:
     kept = table.take(rows)
-    return kept.without_attributes() if options.coordinates_only else kept
+    if options.coordinates_only:
+        return kept.without_attributes()
+    return kept
 
 
 def _rows(
@@ -273,11 +301,13 @@ def _rows(
     weight = weights_of(finite, options.weight, source)
     heavy = np.flatnonzero(weight)
     check_positive(len(heavy), m, f"--weight {options.weight} of {source}")
-    of_heavy = None if channels is None else channels[torch.from_numpy(heavy)]
+    of_heavy = _rows_of_channels(channels, heavy)
     rows, generated = _rows_of_weighted(
         source, finite.take(heavy), m, options, of_heavy, weight[heavy]
     )
-    return None if rows is None else heavy[rows], generated
+    if rows is not None:
+        rows = heavy[rows]
+    return rows, generated
 
 
 def _rows_of_weighted(
@@ -291,17 +321,28 @@ def _rows_of_weighted(
     if options.space is not None:
         return _rows_in_space(table, m, options, source, weight), None
     sampler = load_sampler(options, m)
-    normals = normals_of(table) if isinstance(sampler, ByNormals) else None
+    normals = None
+    if isinstance(sampler, ByNormals):
+        normals = normals_of(table)
     return sample_cloud(table.points, sampler, m, options, source, weight, channels, normals)
 
 
 def _rows_in_space(
-    table: Table, m: int, options: Options, source: Path, weight: NDArray[np.float64] | None
+    table: Table,
+    m: int,
+    options: Options,
+    source: Path,
+    weight: NDArray[np.float64] | None,
 ) -> NDArray[np.int64]:
     """Choose farthest points, or those of sample elimination, by the columns that count."""
     used = in_space(table, options.space, source)
     check_coordinates(source, used)
-    weights = None if weight is None else torch.from_numpy(weight)[None]
-    choose = poisson_rows if options.method == "poisson" else farthest_rows
-    points = torch.from_numpy(used)[None]
-    return choose(points, m, options.seed, weight=weights, in_sphere=True)[0].numpy()
+    weights = None
+    if weight is not None:
+        weights = torch.from_numpy(weight)[None]
+    clouds = torch.from_numpy(used)[None]
+    if options.method == "poisson":
+        rows = poisson_rows(clouds, m, options.seed, weights, in_sphere=True)
+    else:
+        rows = farthest_rows(clouds, m, options.seed, weight=weights, in_sphere=True)
+    return rows[0].numpy()

@@ -36,7 +36,8 @@ def downsample(arguments: list[str], prog: str = "mops-lightning downsample") ->
         prog: what the user typed to start this command.
     """
     with one_line_endings(prog, "interrupted. Run the same command to do the rest."):
-        sys.exit(_downsample(parsed(arguments, prog, DOWNSAMPLE, _downsample_arguments)))
+        chosen = parsed(arguments, prog, DOWNSAMPLE, _downsample_arguments)
+        sys.exit(_downsample(chosen))
 
 
 def _budget_arguments(add: Add) -> None:
@@ -174,7 +175,8 @@ def _downsample_files(chosen: argparse.Namespace, options: Options) -> int:
     inputs = find_inputs(chosen.source, chosen.target)
     is_folder = is_many(chosen.source)
     source, target = inputs.pairs[0]
-    if options.columns and not any(path.suffix.lower() == ".bin" for path, _ in inputs.pairs):
+    suffixes = {path.suffix.lower() for path, _ in inputs.pairs}
+    if options.columns and ".bin" not in suffixes:
         raise UserError(f"--columns is for .bin files, got {chosen.source}.")
     if chosen.total and not is_folder:
         raise UserError(f"--total is for a folder, got the file {chosen.source}.")
@@ -182,8 +184,10 @@ def _downsample_files(chosen: argparse.Namespace, options: Options) -> int:
         raise UserError(f"{target} exists. Give another OUT, or --overwrite.")
     if chosen.map is not None:
         _check_map(chosen, is_folder, (source, target))
-    # Of a run that was killed.
-    remove_temporary(chosen.target if is_folder else target.parent, below=is_folder)
+    folder = target.parent
+    if is_folder:
+        folder = chosen.target
+    remove_temporary(folder, below=is_folder)  # of a run that was killed
     with _engine(chosen, not is_folder) as engine:
         if not is_folder:
             process_file(source, target, options, engine)
@@ -191,7 +195,7 @@ def _downsample_files(chosen: argparse.Namespace, options: Options) -> int:
         failed = process_folder(
             inputs, options, chosen.target, chosen.workers, engine, is_total=chosen.total
         )
-        return 1 if failed else 0
+    return min(failed, 1)
 
 
 def _check_map(chosen: argparse.Namespace, is_folder: bool, files: tuple[Path, Path]) -> None:
@@ -210,15 +214,18 @@ def _options(chosen: argparse.Namespace) -> Options:
     if chosen.total and chosen.m is None:
         raise UserError("--total is for --m: a spacing or voxels hold for every file alike.")
     _check_cluster(chosen)
-    values: dict[str, Any] = {
-        field.name: getattr(chosen, field.name, None) for field in fields(Options)
-    }
-    values["m"] = None if chosen.m is None else parse_size(chosen.m)
+    values: dict[str, Any] = {}
+    for field in fields(Options):
+        values[field.name] = getattr(chosen, field.name, None)
+    if chosen.m is not None:
+        values["m"] = parse_size(chosen.m)
     for name in ("spacing", "voxel"):
         if values[name] is not None:
             values[name] = parse_distance(f"--{name}", values[name])
-    values["space"] = None if chosen.space is None else parse_space(chosen.space)
-    values["strata"] = None if chosen.stratify is None else Strata.parse(chosen.stratify)
+    if chosen.space is not None:
+        values["space"] = parse_space(chosen.space)
+    if chosen.stratify is not None:
+        values["strata"] = Strata.parse(chosen.stratify)
     values["columns"] = columns_of(chosen)
     values["area"] = Area.parse(chosen.bounds, chosen.level, chosen.resolution)
     values["readout"] = chosen.readout or "completed"
@@ -236,8 +243,11 @@ def _check_cluster(chosen: argparse.Namespace) -> None:
 
 def _engine(chosen: argparse.Namespace, is_file: bool) -> AbstractContextManager[Engine | None]:
     """Return the engine; None for a folder without ``--cluster``: its files are shared."""
-    if not chosen.cluster:
-        return nullcontext(Engine(progress=True) if is_file else None)
-    from mops_lightning.files.engine import dask_engine
+    if chosen.cluster:
+        from mops_lightning.files.engine import dask_engine
 
-    return dask_engine(chosen.cluster, progress=is_file)
+        return dask_engine(chosen.cluster, progress=is_file)
+    engine = None
+    if is_file:
+        engine = Engine(progress=True)
+    return nullcontext(engine)

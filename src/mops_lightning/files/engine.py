@@ -30,7 +30,10 @@ class Engine:
         self.progress = progress
 
     def map(
-        self, title: str, function: Callable[[range], Any], row_ranges: list[range]
+        self,
+        title: str,
+        function: Callable[[range], Any],
+        row_ranges: list[range],
     ) -> Iterable[Any]:
         """Return ``function(rows)`` for every range of rows, in order.
 
@@ -40,7 +43,9 @@ class Engine:
             row_ranges: ranges of rows, which are independent of each other.
         """
         results = map(function, row_ranges)
-        return with_progress(results, title, len(row_ranges)) if self.progress else results
+        if not self.progress:
+            return results
+        return with_progress(results, title, len(row_ranges))
 
 
 def with_progress(results: Iterable[Any], title: str, total: int) -> Iterable[Any]:
@@ -99,7 +104,10 @@ class DaskEngine(Engine):
         self.client = client
 
     def map(
-        self, title: str, function: Callable[[range], Any], row_ranges: list[range]
+        self,
+        title: str,
+        function: Callable[[range], Any],
+        row_ranges: list[range],
     ) -> Iterator[Any]:
         """See ``Engine.map``.
 
@@ -110,9 +118,10 @@ class DaskEngine(Engine):
         from distributed.comm import CommClosedError
 
         try:
-            results = self._results(function, row_ranges)
-            total = len(row_ranges)
-            yield from with_progress(results, title, total) if self.progress else results
+            results: Iterable[Any] = self._results(function, row_ranges)
+            if self.progress:
+                results = with_progress(results, title, len(row_ranges))
+            yield from results
         except KilledWorker:
             raise UserError(
                 f"--cluster: workers died repeatedly ({title}), perhaps for lack of memory. Try a "
@@ -131,6 +140,7 @@ class DaskEngine(Engine):
         # A task, not scattered data: Dask repeats it when the worker that holds it dies.
         shared = self.client.submit(lambda: function, pure=False)
         functions = [shared] * len(row_ranges)
-        futures = self.client.map(call, functions, row_ranges, pure=False)[::-1]
+        futures = self.client.map(call, functions, row_ranges, pure=False)
+        futures.reverse()
         while futures:
             yield futures.pop().result()  # workers forget a result that nothing refers to

@@ -33,12 +33,15 @@ def channels_for(
     if not channels:
         return None
     values = feature_values(table, channels.features, source, SETTING, estimates)
-    return channels.scaled(torch.from_numpy(values)).float()
+    scaled = channels.scaled(torch.from_numpy(values))
+    return scaled.float()
 
 
 def with_channels(places: Tensor, values: Tensor | None) -> Tensor:
     """Return places ``(N, 3)`` followed by channels ``(N, C)``, if there are any."""
-    return places if values is None else torch.cat([places, values], 1)
+    if values is None:
+        return places
+    return torch.cat([places, values], 1)
 
 
 def generated_columns(
@@ -57,11 +60,14 @@ def generated_columns(
     first = 0
     for feature in channels.features:
         names = stored_names(table, feature)
-        width = 3 if feature == NORMALS else 1
+        expected: tuple[str, ...] = (feature,)
+        if feature == NORMALS:
+            expected = STORED_NORMALS[0]
+        width = len(expected)
         of_feature = values[:, first : first + width].T
         if not names:
-            names = STORED_NORMALS[0] if feature == NORMALS else (feature,)
-            columns |= {n: v.astype(np.float32) for n, v in zip(names, of_feature, strict=True)}
+            for name, column in zip(expected, of_feature, strict=True):
+                columns[name] = column.astype(np.float32)
         else:
             for name, column in zip(names, of_feature, strict=True):
                 columns[name] = as_stored(column, table.columns[name])

@@ -17,5 +17,7 @@ def normals_of(table: Table) -> NDArray[np.float64] | None:
     normals = stored_values(table, NORMALS)
     if normals is None:
         return None
-    is_usable = np.isfinite(normals).all() and normals.any(axis=1).all()
-    return normals if is_usable else None
+    are_finite = np.isfinite(normals).all()
+    if not are_finite or not normals.any(axis=1).all():
+        return None
+    return normals

@@ -79,16 +79,22 @@ class Options:
 
     def _check_budget(self) -> None:
         """Reject anything but one budget, and one way of keeping to it."""
-        budgets = {"--m": self.m, "--spacing": self.spacing, "--voxel": self.voxel}
+        budgets = {
+            "--m": self.m,
+            "--spacing": self.spacing,
+            "--voxel": self.voxel,
+        }
         given = [name for name, value in budgets.items() if value is not None]
         if len(given) > 1:
-            raise UserError(f"give one of --m, --spacing and --voxel, got {' and '.join(given)}.")
+            names = " and ".join(given)
+            raise UserError(f"give one of --m, --spacing and --voxel, got {names}.")
         if self.is_by_distance:
             self._check_distance(given[0])
             return
         if self.weights is None and self.method is None:
+            methods = "|".join(UNTRAINED)
             raise UserError(
-                f"give --method {'|'.join(UNTRAINED)}, or --weights MODEL; or instead of --m "
+                f"give --method {methods}, or --weights MODEL; or instead of --m "
                 "--spacing or --voxel."
             )
         if self.weights is not None and self.method is not None:
@@ -106,7 +112,9 @@ class Options:
 
     def _check_distance(self, name: str) -> None:
         """Reject what a spacing or voxels exclude."""
-        distance = self.voxel if self.spacing is None else self.spacing
+        distance = self.spacing
+        if distance is None:
+            distance = self.voxel
         assert distance is not None
         if not (isfinite(distance) and distance > 0):
             raise UserError(f"{name} must be a number above 0, in the file's unit, got {distance}.")
@@ -114,7 +122,8 @@ class Options:
             raise UserError(f"{name} needs neither --method nor --weights.")
         if self.strata is not None:
             raise UserError(f"--stratify shares a number of points among classes: no {name}.")
-        if self.readout == "matched" or (self.readout == "generated" and self.voxel is None):
+        is_mean_of_voxel = self.readout == "generated" and self.voxel is not None
+        if self.readout != "completed" and not is_mean_of_voxel:
             raise UserError(f"{name} keeps input points: no --readout {self.readout}.")
         if self.readout == "generated" and self.weight is not None:
             raise UserError("--weight: the means of voxels take no weights.")
@@ -123,7 +132,8 @@ class Options:
         """Reject a map of another format, or of more rows than points are kept."""
         if self.map is not None and self.map.suffix.lower() != ".npz":
             raise UserError(f"--map must end in .npz, got {self.map}.")
-        if self.map_k < 1 or (isinstance(self.m, int) and self.map_k > self.m):
+        is_too_large = isinstance(self.m, int) and self.map_k > self.m
+        if self.map_k < 1 or is_too_large:
             raise UserError(f"--map-k must be from 1 to --m, got {self.map_k}.")
         if self.map is None and self.map_k != 1:
             raise UserError(f"--map-k {self.map_k} has no effect without --map FILE.npz.")
@@ -132,11 +142,12 @@ class Options:
         """Reject tiles and chunks out of range, or with options that they exclude."""
         if self.tile is not None and self.tile < 2:
             raise UserError(f"--tile must be at least 2, got {self.tile}.")
-        if self.tile is not None and self.m is None and not self.is_by_distance:
+        tiles_by_number = self.tile is not None and not self.is_by_distance
+        if tiles_by_number and self.m is None:
             raise UserError("--tile needs --m, the number of points to keep of all tiles together.")
-        if self.tile is not None and self.readout != "completed" and not self.is_by_distance:
+        if tiles_by_number and self.readout != "completed":
             raise UserError(f"--tile keeps different input points: no --readout {self.readout}.")
-        if self.weight is not None and self.tile is not None and not self.is_by_distance:
+        if tiles_by_number and self.weight is not None:
             raise UserError("--weight needs the whole cloud at once: leave --tile out.")
         if self.chunk is not None and self.map is not None:
             raise UserError("--map needs the whole cloud in memory: use propagate after --chunk.")
@@ -176,7 +187,8 @@ class Options:
     def needs_columns(self) -> bool:
         """Whether attributes are kept, or decide which points are."""
         decides = (self.weight, self.space, self.strata, self.weights)
-        return any(one is not None for one in decides) or not self.coordinates_only
+        is_decided_by_columns = any(setting is not None for setting in decides)
+        return is_decided_by_columns or not self.coordinates_only
 
     def number(self, trained: int, points: int) -> int:
         """Return how many of so many points to keep.
@@ -185,7 +197,9 @@ class Options:
             trained: the number that the sampler was made for.
             points: number of points of the file.
         """
-        return trained if self.m is None else number_of(self.m, points)
+        if self.m is None:
+            return trained
+        return number_of(self.m, points)
 
 
 def parse_size(text: str) -> Size:
@@ -233,15 +247,15 @@ def parse_space(text: str) -> tuple[tuple[str, float], ...]:
     Raises:
         UserError: a factor is no number of at least 0, or a name is given twice.
     """
-    factors: dict[str, float] = {"x": 1.0, "y": 1.0, "z": 1.0}
+    factors = {"x": 1.0, "y": 1.0, "z": 1.0}
     named = set()
     for word in text.split(","):
         name, equals, number = word.strip().partition("=")
-        try:
-            factor = float(number) if equals else 1.0
-        except ValueError:
-            factor = -1.0
-        if not name or name in named or not (isfinite(factor) and factor >= 0):
+        factor = 1.0
+        if equals:
+            factor = _factor(number)
+        is_new = name != "" and name not in named
+        if not is_new or not (isfinite(factor) and factor >= 0):
             raise UserError(
                 f"--space must be columns with factors of at least 0, such as intensity=0.01,z=2, "
                 f"got {text!r}."
@@ -251,3 +265,10 @@ def parse_space(text: str) -> tuple[tuple[str, float], ...]:
     if not any(factors.values()):
         raise UserError("--space: all factors are 0.")
     return tuple(factors.items())
+
+
+def _factor(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return -1.0  # which is refused

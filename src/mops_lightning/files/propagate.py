@@ -36,7 +36,9 @@ def write_map(path: Path, points: Points, sampled: Points, k: int) -> None:
     near = propagation_map(points[is_finite], sampled, k)
     rows = np.full((len(points), k), -1, np.int32)
     rows[is_finite] = near.rows.numpy()
-    arrays: dict[str, Any] = {"rows": rows, "m": len(sampled)}
+    arrays: dict[str, Any] = {}
+    arrays["rows"] = rows
+    arrays["m"] = len(sampled)
     if k > 1:  # the weight of one point is 1
         weights = np.zeros((len(points), k), np.float32)
         weights[is_finite] = near.weights.numpy()
@@ -96,7 +98,8 @@ def propagate_file(
     tables = _tables(big, columns)
     form = _measure(big, tables("measuring"))
     parts = (carry(table) for table in tables("propagating"))
-    write(target, replace(form, parts=parts, columns={**form.columns, **carried}))
+    columns_of_both = {**form.columns, **carried}
+    write(target, replace(form, parts=parts, columns=columns_of_both))
     return form.number
 
 
@@ -115,15 +118,18 @@ def _carried(name: str, values: Column, near: PropagationMap, mean: bool) -> Col
             f"--field {name}: only packed colours of 32 bits can be averaged, got "
             f"{values.dtype}. Leave --k out."
         )
-    channels = np.ascontiguousarray(values).view(np.uint8).reshape(-1, 4)
+    colours = np.ascontiguousarray(values)
+    channels = colours.view(np.uint8).reshape(-1, 4)
     averaged = np.ascontiguousarray(propagate(channels, near, mean=True))
-    return averaged.view(values.dtype)[:, 0]
+    packed = averaged.view(values.dtype)
+    return packed[:, 0]
 
 
 def _read(path: Path, columns: Sequence[str] | None) -> Table:
     """Read a cloud; a mesh has no points that could be matched."""
     if path.suffix.lower() not in READERS:
-        raise guard.BadCloudError(f"{path} must end in {', '.join(READERS)}.")
+        endings = ", ".join(READERS)
+        raise guard.BadCloudError(f"{path} must end in {endings}.")
     with guard.reading(path):
         table = read_points(path, columns)
     if table is None or not len(table.finite().points):
@@ -165,7 +171,8 @@ def _measure(path: Path, tables: Iterable[Table]) -> TableParts:
             first = table
             columns = dict(table.columns)
         for name, column in table.columns.items():
-            columns[name] = np.concatenate([columns[name], _extremes(column)])
+            with_extremes = [columns[name], _extremes(column)]
+            columns[name] = np.concatenate(with_extremes)
         guard.check_coordinates(path, table.points)
         number += len(table.points)
         low = np.minimum(low, table.points.min(0))

@@ -62,18 +62,25 @@ def sample_cloud(
     check_coordinates(source, points)
     if options.tile is not None:
         return sample_by_tiles(points, options.tile, m, sampler, channels), None
-    weights = None if weight is None else torch.from_numpy(weight)[None]
+    weights = None
+    if weight is not None:
+        weights = torch.from_numpy(weight)[None]
     if sampler.any_unit:
-        _, chosen = sampler.select(options.readout, torch.from_numpy(points)[None], m, weights)
-        assert chosen is not None  # such a sampler generates no points
-        return chosen[0].numpy(), None
+        clouds = torch.from_numpy(points)[None]
+        _, rows = sampler.select(options.readout, clouds, m, weights)
+        assert rows is not None  # such a sampler generates no points
+        return rows[0].numpy(), None
     sphere = UnitSphere.around(points)
     if isinstance(sampler, ByNormals):
         given = None if normals is None else torch.from_numpy(normals)[None]
         return sampler.rows(sphere.normalise(points)[None], m, given)[0].numpy(), None
     seen = with_channels(sphere.normalise(points), channels)
-    new, found = sampler.select(options.readout, seen[None], m, weights)
-    if found is not None:
-        return found[0].numpy(), None
-    of_generated = None if channels is None else new[0, :, 3:]
-    return None, Generated(sphere.restore(new[0, :, :3]), of_generated)
+    new, rows = sampler.select(options.readout, seen[None], m, weights)
+    if rows is not None:
+        return rows[0].numpy(), None
+    generated = new[0]
+    of_generated = None
+    if channels is not None:
+        of_generated = generated[:, 3:]
+    restored = sphere.restore(generated[:, :3])
+    return None, Generated(restored, of_generated)

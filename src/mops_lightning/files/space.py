@@ -14,10 +14,12 @@ from mops_lightning.errors import did_you_mean
 Space = tuple[tuple[str, float], ...]
 """Columns and their factors, x, y and z among them."""
 
-WKT, GEO_KEYS = 2112, 34735
+WKT = 2112
+GEO_KEYS = 34735
 """Numbers of the records of a LAS file that hold a coordinate system (LAS 1.4 R15)."""
 
-MODEL_KEY, GEOGRAPHIC = 1024, 2
+MODEL_KEY = 1024
+GEOGRAPHIC = 2
 """The key of GeoTIFF for the kind of coordinates, and its value for degrees."""
 
 
@@ -63,13 +65,17 @@ def check_unit(header: Any, name: str, path: Path) -> None:
 
 def _is_geographic(header: Header) -> bool:
     """Return what the WKT says, which comes before GeoTIFF keys (LAS 1.4 R15)."""
-    records = {record.number: record.data for record in (*header.records, *header.extended)}
+    records = {}
+    for record in (*header.records, *header.extended):
+        records[record.number] = record.data
     if WKT in records:
         words = records[WKT].decode("utf-8", "replace").upper()
         is_projected = "PROJCS" in words or "PROJCRS" in words
-        return not is_projected and ("GEOGCS" in words or "GEOGCRS" in words)
+        is_geographic = "GEOGCS" in words or "GEOGCRS" in words
+        return is_geographic and not is_projected
     if GEO_KEYS not in records:
         return False
     data = records[GEO_KEYS]
-    numbers = np.frombuffer(data[: len(data) // 8 * 8], "<u2").reshape(-1, 4)
-    return any(key == MODEL_KEY and value == GEOGRAPHIC for key, _, _, value in numbers[1:])
+    whole_keys = len(data) // 8
+    keys = np.frombuffer(data[: whole_keys * 8], "<u2").reshape(-1, 4)
+    return any(key == MODEL_KEY and value == GEOGRAPHIC for key, _, _, value in keys[1:])

@@ -34,7 +34,8 @@ class Strata:
         number = rule.removeprefix("min=")
         if column and rule == "share":
             return cls(column)
-        if column and rule != number and number.isdecimal() and int(number) > 0:
+        is_number = rule != number and number.isdecimal()
+        if column and is_number and int(number) > 0:
             return cls(column, int(number))
         raise UserError(
             "--stratify must be a column and a rule, such as class:share or class:min=50, got "

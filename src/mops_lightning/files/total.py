@@ -49,11 +49,13 @@ def share_total(jobs: list[Job]) -> Shared:
             failures[job.source] = error
         except Exception as error:
             failures[job.source] = UserError(f"{job.source}: {one_line(error)}.")
-    numbers = _numbers(jobs[0].options, sizes) if sizes else []
-    shared = [
-        job._replace(options=replace(job.options, m=number))
-        for job, number in zip(counted, numbers, strict=True)
-    ]
+    if not counted:
+        return Shared([], failures)
+    shared = []
+    numbers = _numbers(jobs[0].options, sizes)
+    for job, number in zip(counted, numbers, strict=True):
+        options = replace(job.options, m=number)
+        shared.append(job._replace(options=options))
     return Shared(shared, failures)
 
 
@@ -71,10 +73,11 @@ def _numbers(options: Options, sizes: list[int]) -> list[int]:
     from mops_lightning.samplers.tiles import shares
 
     assert options.m is not None
-    total = number_of(options.m, sum(sizes))
-    if not len(sizes) <= total <= sum(sizes):
+    points = sum(sizes)
+    total = number_of(options.m, points)
+    if not len(sizes) <= total <= points:
         raise UserError(
-            f"--total: the {len(sizes)} files hold {sum(sizes):,} points; --m must be from one "
+            f"--total: the {len(sizes)} files hold {points:,} points; --m must be from one "
             f"point per file to that number, got {total:,}."
         )
     numbers: list[int] = shares(total, sizes).tolist()

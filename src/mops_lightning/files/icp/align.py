@@ -21,7 +21,11 @@ LEAST = 10
 NEIGHBOURS = 12
 """Nearest points from which normals and covariances are estimated."""
 
-LIMITS = {"max_iterations": 60, "rotation_epsilon": 1e-5, "translation_epsilon": 1e-5}
+LIMITS = {
+    "max_iterations": 60,
+    "rotation_epsilon": 1e-5,
+    "translation_epsilon": 1e-5,
+}
 """Far below the errors that are measured, in radians and the clouds' unit."""
 
 
@@ -131,6 +135,9 @@ def timed_error(
     began = time.process_time()
     found = align(target, source, start, registration, max_distance)
     seconds = time.process_time() - began
-    turn = Rotation.from_matrix(found[:3, :3].T @ truth[:3, :3])
-    apart = (found[:3, :3] - truth[:3, :3]) @ centre + found[:3, 3] - truth[:3, 3]
-    return PoseError(float(np.degrees(turn.magnitude())), float(np.linalg.norm(apart)), seconds)
+    rotation = found[:3, :3]
+    true_rotation = truth[:3, :3]
+    turn = Rotation.from_matrix(rotation.T @ true_rotation)
+    degrees = float(np.degrees(turn.magnitude()))
+    apart = (rotation - true_rotation) @ centre + found[:3, 3] - truth[:3, 3]
+    return PoseError(degrees, float(np.linalg.norm(apart)), seconds)

@@ -10,10 +10,20 @@ from mops_lightning.files.arguments import Add, columns_of, one_of
 
 REGISTRATIONS = ("plane", "gicp")
 
-CROPS = {"crops": 32, "points": 1024, "angle": 15.0, "shift": 0.1, "max_distance": 0.3}
+CROPS = {
+    "crops": 32,
+    "points": 1024,
+    "angle": 15.0,
+    "shift": 0.1,
+    "max_distance": 0.3,
+}
 """Defaults for crops, in radii of a crop."""
 
-FRAMES = {"angle": 2.0, "shift": 0.5, "max_distance": 1.0}
+FRAMES = {
+    "angle": 2.0,
+    "shift": 0.5,
+    "max_distance": 1.0,
+}
 """Defaults for frames, in the files' unit."""
 
 ONLY_ICP = (
@@ -89,9 +99,11 @@ def compare_icp(chosen: argparse.Namespace) -> str:
     small_gicp()  # reports that it is missing before any file is read
     if chosen.poses is not None:
         read_poses(chosen.poses)  # reports its mistakes before any scan is read
+    names = chosen.methods or NAMES
+    weights = one_of(chosen.weights)
     setup = Setup(
         sizes=chosen.m,
-        methods=methods_of(chosen.methods or NAMES, one_of(chosen.weights), chosen.tile, chosen.m),
+        methods=methods_of(names, weights, chosen.tile, chosen.m),
         registrations=chosen.registration,
         draws=chosen.draws,
         motions=chosen.motions,
@@ -102,8 +114,11 @@ def compare_icp(chosen: argparse.Namespace) -> str:
         seed=chosen.seed,
     )
     columns = columns_of(chosen)
-    surface = max(10_000, 8 * (chosen.points or max(chosen.m)))
-    scans = [(path, read_points(path, chosen.seed, columns, surface)) for path in scans_of(folder)]
+    largest = chosen.points or max(chosen.m)
+    surface = max(10_000, 8 * largest)
+    scans = []
+    for path in scans_of(folder):
+        scans.append((path, read_points(path, chosen.seed, columns, surface)))
     pairs_of_draw = _pairs(chosen, scans)
     scores = list(compare_by_icp(pairs_of_draw, setup))
     return write_scores(scores, chosen.out)
@@ -137,8 +152,9 @@ def _fill_defaults(chosen: argparse.Namespace) -> None:
     Raises:
         UserError: a value is out of range.
     """
-    defaults = CROPS if chosen.poses is None else FRAMES
+    defaults = CROPS
     if chosen.poses is not None:
+        defaults = FRAMES
         for name in ("crops", "points"):
             if getattr(chosen, name) is not None:
                 raise UserError(f"--{name} is for crops: leave it out with --poses.")
@@ -146,9 +162,9 @@ def _fill_defaults(chosen: argparse.Namespace) -> None:
     for name, value in (common | defaults).items():
         if getattr(chosen, name) is None:
             setattr(chosen, name, value)
-    for name in ("draws", "motions", "crops", "points"):
+    fewest = {"draws": 1, "motions": 1, "crops": 1, "points": 20}
+    for name, least in fewest.items():
         number = getattr(chosen, name)
-        least = 20 if name == "points" else 1
         if number is not None and number < least:
             raise UserError(f"--{name} must be at least {least}, got {number}.")
     check_at_least(0, **{"--angle": chosen.angle, "--shift": chosen.shift})

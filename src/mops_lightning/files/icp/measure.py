@@ -121,19 +121,18 @@ def compare_by_icp(pairs_of_draw: Callable[[int], list[Pair]], setup: Setup) -> 
         seed = derive_seed(setup.seed, draw)
         starts = draw_motions(pairs, setup.motions, setup.angle, setup.shift, seed)
         whole = [prepare_target(pair.target) for pair in pairs]
-        complete = [
-            Sampled(pair, Sample(pair.source, 0.0), target)
-            for pair, target in zip(pairs, whole, strict=True)
-        ]
+        complete = []
+        for pair, target in zip(pairs, whole, strict=True):
+            complete.append(Sampled(pair, Sample(pair.source, 0.0), target))
         yield from _scores(complete, starts, setup, draw, 0, EVERYTHING)
         for m in setup.sizes:
             for method in setup.methods:
                 if draw == 0:  # imports and compilation are in no method's time
-                    method.sample(pairs[0].source, m, seed, pairs[0].path)
-                samples = [
-                    _sampled(pair, target, method, m, seed, setup)
-                    for pair, target in zip(pairs, whole, strict=True)
-                ]
+                    first = pairs[0]
+                    method.sample(first.source, m, seed, first.path)
+                samples = []
+                for pair, target in zip(pairs, whole, strict=True):
+                    samples.append(_sampled(pair, target, method, m, seed, setup))
                 yield from _scores(samples, starts, setup, draw, m, method.name)
 
 

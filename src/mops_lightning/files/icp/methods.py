@@ -20,7 +20,9 @@ from mops_lightning.zoo.names import UNTRAINED
 
 Points = NDArray[np.float64]
 
-FPS_FARTHEST, FILTER, TRAINED = "fps_farthest", "small_gicp_voxel", "trained"
+FPS_FARTHEST = "fps_farthest"
+FILTER = "small_gicp_voxel"
+TRAINED = "trained"
 
 NAMES = (*UNTRAINED, FPS_FARTHEST, FILTER)
 """Methods without training: ``fps_farthest`` starts at the point farthest from the mean."""
@@ -59,7 +61,8 @@ class ByName(Method):
 
     def sample(self, points: Points, m: int, seed: int, path: Path) -> Sample:
         """Choose m of points ``(N, 3)``."""
-        return _timed(points, m, self._sampler(m, seed), Options(m, method="fps"), path)
+        options = Options(m, method="fps")
+        return _timed(points, m, self._sampler(m, seed), options, path)
 
     def _sampler(self, m: int, seed: int) -> Sampler:
         if self.name == FPS_FARTHEST:
@@ -74,13 +77,16 @@ class ByWeights(Method):
 
     def __init__(self, weights: str, tile: int | None, sizes: Sequence[int]) -> None:
         self.options = {m: Options(m, weights, tile=tile) for m in sizes}
-        self.samplers = {m: load_sampler(options) for m, options in self.options.items()}
+        self.samplers = {}
+        for m, options in self.options.items():
+            self.samplers[m] = load_sampler(options)
         for sampler in self.samplers.values():
             if sampler.point_channels:
+                names = ", ".join(sampler.point_channels.features)
                 raise UserError(
-                    f"--weights: {weights} was trained with the features "
-                    f"{', '.join(sampler.point_channels.features)}, but scans are registered by x, "
-                    "y and z only. Give a sampler that was trained without features."
+                    f"--weights: {weights} was trained with the features {names}, but scans are "
+                    "registered by x, y and z only. Give a sampler that was trained without "
+                    "features."
                 )
 
     def sample(self, points: Points, m: int, seed: int, path: Path) -> Sample:
@@ -101,7 +107,8 @@ class VoxelFilter(Method):
         """Return at most m means of points ``(N, 3)``; the seed has no effect."""
         library = small_gicp()
         extent = float(np.ptp(points, axis=0).max()) or 1.0
-        fine, coarse = extent / 2**19, 2 * extent  # small_gicp's voxels have 21 bits along an axis
+        fine = extent / 2**19  # small_gicp's voxels have 21 bits along an axis
+        coarse = 2 * extent
         for _ in range(BISECTIONS):
             middle = np.sqrt(fine * coarse)
             if library.voxelgrid_sampling(points, middle).size() > m:
@@ -110,11 +117,15 @@ class VoxelFilter(Method):
                 coarse = middle
         began = time.process_time()
         means = library.voxelgrid_sampling(points, coarse).points()
-        return Sample(np.ascontiguousarray(means[:, :3]), time.process_time() - began)
+        seconds = time.process_time() - began
+        return Sample(np.ascontiguousarray(means[:, :3]), seconds)
 
 
 def methods_of(
-    names: Sequence[str], weights: str | None, tile: int | None, sizes: Sequence[int]
+    names: Sequence[str],
+    weights: str | None,
+    tile: int | None,
+    sizes: Sequence[int],
 ) -> list[Method]:
     """Return the methods of a comparison.
 
@@ -125,8 +136,12 @@ def methods_of(
     methods: list[Method] = []
     for name in names:
         if name not in NAMES:
-            raise UserError(f"--methods: unknown {name!r}.{did_you_mean(name, NAMES)}")
-        methods.append(VoxelFilter() if name == FILTER else ByName(name))
+            hint = did_you_mean(name, NAMES)
+            raise UserError(f"--methods: unknown {name!r}.{hint}")
+        if name == FILTER:
+            methods.append(VoxelFilter())
+        else:
+            methods.append(ByName(name))
     if weights is not None:
         methods.append(ByWeights(weights, tile, sizes))
     return methods

@@ -43,9 +43,8 @@ def scans_of(folder: Path) -> list[Path]:
         UserError: it has no file that can be read.
     """
     names = list_files(folder, READABLE)
-    return [
-        folder / name for name in sorted(names, key=lambda name: (name.parent, by_number(name)))
-    ]
+    in_order = sorted(names, key=lambda name: (name.parent, by_number(name)))
+    return [folder / name for name in in_order]
 
 
 def read_points(path: Path, seed: int, columns: Sequence[str] | None, surface: int) -> Points:
@@ -54,7 +53,10 @@ def read_points(path: Path, seed: int, columns: Sequence[str] | None, surface: i
 
 
 def crop_pairs(
-    scans: Sequence[tuple[Path, Points]], n_points: int, crops: int, seed: int
+    scans: Sequence[tuple[Path, Points]],
+    n_points: int,
+    crops: int,
+    seed: int,
 ) -> list[Pair]:
     """Draw crops of scans in the unit sphere, and split each at random into two halves.
 
@@ -77,11 +79,16 @@ def crop_pairs(
                 f"{path} has {len(points):,} points, fewer than --points {n_points}. Lower "
                 "--points, or remove the file."
             )
-        rng = np.random.default_rng(derive_seed(seed, zlib.crc32(path.name.encode())))
-        for crop in random_crops(points, n_points, crops, "nearest", rng, path).points:
+        number_of_file = zlib.crc32(path.name.encode())
+        rng = np.random.default_rng(derive_seed(seed, number_of_file))
+        drawn = random_crops(points, n_points, crops, "nearest", rng, path)
+        for crop in drawn.points:
             radius = float(np.linalg.norm(crop, axis=1).max())
-            shuffled = rng.permutation(crop.astype(np.float64) / radius)
-            pairs.append(Pair(path, shuffled[:half], shuffled[half : 2 * half], np.eye(4)))
+            unit = crop.astype(np.float64) / radius
+            shuffled = rng.permutation(unit)
+            source = shuffled[:half]
+            target = shuffled[half : 2 * half]
+            pairs.append(Pair(path, source, target, truth=np.eye(4)))
     return pairs
 
 
@@ -103,9 +110,11 @@ def frame_pairs(frames: Sequence[tuple[Path, Points]], poses: Path) -> list[Pair
         )
     pairs = []
     for before in range(len(frames) - 1):
-        path, points = frames[before + 1]
-        truth = np.linalg.solve(known[before], known[before + 1])
-        pairs.append(Pair(path, points, frames[before][1], truth))
+        after = before + 1
+        _, target = frames[before]
+        path, source = frames[after]
+        truth = np.linalg.solve(known[before], known[after])
+        pairs.append(Pair(path, source, target, truth))
     return pairs
 
 
@@ -137,10 +146,11 @@ def draw_motions(
             axis, direction = rng.normal(size=(2, 3))
             turn = np.radians(angle) * rng.random() * axis / np.linalg.norm(axis)
             length = shift * rng.random()
+            rotation = Rotation.from_rotvec(turn).as_matrix()
+            about_centre = centre - rotation @ centre
             motion = np.eye(4)
-            motion[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
-            motion[:3, 3] = centre - motion[:3, :3] @ centre
-            motion[:3, 3] += length * direction / np.linalg.norm(direction)
+            motion[:3, :3] = rotation
+            motion[:3, 3] = about_centre + length * direction / np.linalg.norm(direction)
             poses.append(pair.truth @ motion)
         starts.append(poses)
     return starts

@@ -25,7 +25,8 @@ def read_poses(path: Path) -> NDArray[np.float64]:
         UserError: the file holds something else.
     """
     lines = _lines(path)
-    poses = np.tile(np.eye(4), (len(lines), 1, 1))
+    identity = np.eye(4)
+    poses = np.tile(identity, (len(lines), 1, 1))
     for pose, (number, words) in zip(poses, lines, strict=True):
         pose[:3] = _pose(path, number, words)
     return poses
@@ -37,8 +38,11 @@ def _lines(path: Path) -> list[tuple[int, list[str]]]:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"--poses: {path} cannot be read as text: {error}.") from None
-    numbered = [(number, line.split()) for number, line in enumerate(text.splitlines(), 1)]
-    lines = [(number, words) for number, words in numbered if words and words[0][0] != "#"]
+    lines = []
+    for number, line in enumerate(text.splitlines(), 1):
+        words = line.split()
+        if words and not words[0].startswith("#"):
+            lines.append((number, words))
     if not lines:
         raise UserError(f"--poses: {path} has no pose. Give {FORMS}.")
     return lines
@@ -50,14 +54,18 @@ def _pose(path: Path, number: int, words: list[str]) -> NDArray[np.float64]:
         values = np.array(words, np.float64)
     except ValueError:
         values = np.empty(0)
-    if len(values) not in (8, 12) or not np.isfinite(values).all():
+    has_length = len(values) in (8, 12)
+    if not has_length or not np.isfinite(values).all():
         raise UserError(f"--poses: line {number} of {path} is no pose. Give {FORMS}.")
     if len(values) == 12:
         rows = values.reshape(3, 4)
-        if not np.allclose(rows[:, :3] @ rows[:, :3].T, np.eye(3), atol=1e-2):
+        rotation = rows[:, :3]
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-2):
             raise UserError(f"--poses: line {number} of {path} has no rotation.")
         return rows
+    translation = values[1:4]
     quaternion = values[4:]
     if not 0.9 < np.linalg.norm(quaternion) < 1.1:
         raise UserError(f"--poses: line {number} of {path} has no unit quaternion.")
-    return np.column_stack([Rotation.from_quat(quaternion).as_matrix(), values[1:4]])
+    rotation = Rotation.from_quat(quaternion).as_matrix()
+    return np.column_stack([rotation, translation])

@@ -1,5 +1,6 @@
 """The table of a comparison by registration."""
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -63,10 +64,11 @@ def sentences_of(frame: pd.DataFrame) -> list[str]:
     """Return for every registration which method to use for how many points; see ``as_text``."""
     sentences = []
     for registration in frame.registration.unique():
-        chosen = frame[(frame.registration == registration) & (frame.m > 0)]
-        scores: dict[int, dict[str, list[float]]] = {}
-        for (m, method), group in chosen.groupby(["m", "method"], sort=False):
-            scores.setdefault(int(m), {})[str(method)] = group.degrees.tolist()
+        is_chosen = (frame.registration == registration) & (frame.m > 0)
+        scores: dict[int, dict[str, list[float]]] = defaultdict(dict)
+        groups = frame[is_chosen].groupby(["m", "method"], sort=False)
+        for (m, method), group in groups:
+            scores[int(m)][str(method)] = group.degrees.tolist()
         sentence = verdict(scores, ROTATION, [TRAINED])
         if sentence:
             sentences.append(f"{registration}: {sentence}")
@@ -88,13 +90,17 @@ def grids_of(frame: pd.DataFrame) -> list[Grid]:
     for registration in frame.registration.unique():
         by_registration = frame[frame.registration == registration]
         for m in by_registration.m.unique():
-            grids.append(_grid(by_registration[by_registration.m == m], registration, m))
+            of_size = by_registration[by_registration.m == m]
+            grids.append(_grid(of_size, registration, m))
     return grids
 
 
 def _grid(frame: pd.DataFrame, registration: str, m: int) -> Grid:
-    size = f"{m:,} points" if m else "all points"
-    draws, pairs = frame.draw.nunique(), frame.pairs.iloc[0]
+    size = "all points"
+    if m:
+        size = f"{m:,} points"
+    draws = frame.draw.nunique()
+    pairs = frame.pairs.iloc[0]
     title = f"{registration}, {size}: {draws} draws of {pairs} alignments"
     rival = frame[frame.method == RIVAL].degrees
     rows = []
@@ -102,7 +108,8 @@ def _grid(frame: pd.DataFrame, registration: str, m: int) -> Grid:
         by_draw = frame[frame.method == method]
         against = "-"
         if len(rival) and method != RIVAL:
-            against = _spread(by_draw.degrees.to_numpy() / rival.to_numpy() - 1, 100, "+.1f")
+            ratios = by_draw.degrees.to_numpy() / rival.to_numpy()
+            against = _spread(ratios - 1, 100, "+.1f")
         rows.append(
             [
                 method,
@@ -122,4 +129,7 @@ def _spread(values: Sequence[float], scale: float, form: str) -> str:
     """Return the mean of the draws, and their standard deviation where there are several."""
     scaled = [scale * value for value in values]
     mean = format(fmean(scaled), form)
-    return f"{mean} ± {format(stdev(scaled), form.lstrip('+'))}" if len(scaled) > 1 else mean
+    if len(scaled) == 1:
+        return mean
+    deviation = format(stdev(scaled), form.lstrip("+"))
+    return f"{mean} ± {deviation}"

@@ -53,6 +53,9 @@ def compare_by_net(chosen: argparse.Namespace) -> None:
     if chosen.loss is not None:
         net = imported_module(chosen.task_net)
         loss = imported(chosen.loss, "--loss")
+    draws = chosen.draws
+    if draws is None:
+        draws = DRAWS
     comparison = compare_task_net(
         chosen.files,
         net,
@@ -60,7 +63,7 @@ def compare_by_net(chosen: argparse.Namespace) -> None:
         loss=loss,
         weights=chosen.weights or (),
         methods=chosen.methods,
-        draws=DRAWS if chosen.draws is None else chosen.draws,
+        draws=draws,
         crops=chosen.crops,
         points=chosen.points,
         label=chosen.label,
@@ -70,5 +73,6 @@ def compare_by_net(chosen: argparse.Namespace) -> None:
         out=chosen.out,
         overwrite=chosen.overwrite,
     )
-    print(f"files in {chosen.out}/: {', '.join(FILES)}")
+    files = ", ".join(FILES)
+    print(f"files in {chosen.out}/: {files}")
     print(comparison.text, end="")

@@ -50,7 +50,10 @@ class Source:
 
 
 def read_sources(
-    files: Sequence[Path], subject: Subject, seed: int, columns: Sequence[str] | None
+    files: Sequence[Path],
+    subject: Subject,
+    seed: int,
+    columns: Sequence[str] | None,
 ) -> list[Source]:
     """Read all files.
 
@@ -67,11 +70,14 @@ def read_sources(
     labels = [_label(path, classes, subject) for path in files]
     halves = _halves(labels, seed)
     sources = []
+    n_points = subject.n_points
+    surface = max(10_000, 8 * n_points)
     for path, label, half in zip(files, labels, halves, strict=True):
-        table = read(path, max(10_000, 8 * subject.n_points), seed, columns=columns).finite()
-        if len(table.points) < subject.n_points:
+        table = read(path, surface, seed, columns=columns).finite()
+        number = len(table.points)
+        if number < n_points:
             raise UserError(
-                f"{path} has {len(table.points):,} points, fewer than the {subject.n_points:,} of "
+                f"{path} has {number:,} points, fewer than the {n_points:,} of "
                 "a cloud. Lower --points, or remove the file."
             )
         values = None
@@ -79,8 +85,9 @@ def read_sources(
             values = feature_values(table, subject.channels.features, path, "--task-net")
         parts = None
         if subject.label is not None:
-            numbers = table.whole_numbers(subject.label, path)
-            parts = numbers if not subject.outputs else _positions(numbers, subject, path)
+            parts = table.whole_numbers(subject.label, path)
+            if subject.outputs:
+                parts = _positions(parts, subject, path)
         sources.append(Source(path, table.points, values, parts, label, half))
     return sources
 
@@ -97,7 +104,9 @@ def _label(path: Path, classes: Sequence[str], subject: Subject) -> int:
     for folder in path.absolute().parents:
         if folder.name in classes:
             return classes.index(folder.name)
-    shown = ", ".join(classes[:5]) + (", ..." if len(classes) > 5 else "")
+    shown = ", ".join(classes[:5])
+    if len(classes) > 5:
+        shown += ", ..."
     raise UserError(
         f"{path}: no folder above it is a class of {subject.name}: {shown}. Put every file into a "
         "folder of its class."
@@ -106,7 +115,8 @@ def _label(path: Path, classes: Sequence[str], subject: Subject) -> int:
 
 def _halves(labels: Sequence[int], seed: int) -> list[str]:
     """Share files between two halves, those of every class alike."""
-    order = np.random.default_rng(derive_seed(seed, 7)).permutation(len(labels)).tolist()
+    rng = np.random.default_rng(derive_seed(seed, 7))
+    order = rng.permutation(len(labels)).tolist()
     order.sort(key=lambda place: labels[place])
     halves = [""] * len(labels)
     for rank, place in enumerate(order):
@@ -125,16 +135,19 @@ def _positions(numbers: NDArray[np.int64], subject: Subject, path: Path) -> NDAr
         known = np.array([int(name) for name in names], np.int64)
     else:
         known = np.arange(len(names))
-    unknown = numbers[(numbers >= 0) & ~np.isin(numbers, known)]
+    is_given = numbers >= 0
+    unknown = numbers[is_given & ~np.isin(numbers, known)]
     if len(unknown):
+        known_numbers = ", ".join(map(str, known[:9].tolist()))
         raise UserError(
             f"{path}: {len(unknown):,} points have a {subject.label} that {subject.name} does not "
-            f"know, such as {unknown[0]}; it knows {', '.join(map(str, known[:9].tolist()))}. Give "
+            f"know, such as {unknown[0]}; it knows {known_numbers}. Give "
             "them a number below 0."
         )
     order = known.argsort()
-    found = order[np.searchsorted(known, numbers, sorter=order).clip(max=len(known) - 1)]
-    positions: NDArray[np.int64] = np.where(numbers < 0, UNKNOWN, found)
+    places = np.searchsorted(known, numbers, sorter=order)
+    found = order[places.clip(max=len(known) - 1)]
+    positions: NDArray[np.int64] = np.where(is_given, found, UNKNOWN)
     return positions
 
 
@@ -155,13 +168,16 @@ def batches(
     members = [source for source in sources if source.half == half]
     per_batch = max(1, BATCH // subject.crops)
     for first in range(0, len(members), per_batch):
-        drawn = [_draw(source, subject, seed) for source in members[first : first + per_batch]]
-        yield from _joined(drawn, subject, derive_seed(seed, HALVES.index(half), first))
+        of_batch = members[first : first + per_batch]
+        drawn = [_draw(source, subject, seed) for source in of_batch]
+        seed_of_batch = derive_seed(seed, HALVES.index(half), first)
+        yield from _joined(drawn, subject, seed_of_batch)
 
 
 def _draw(source: Source, subject: Subject, seed: int) -> Batch:
     """Draw the clouds of one file, as in training."""
-    rng = np.random.default_rng(derive_seed(seed, zlib.crc32(source.path.name.encode())))
+    number_of_file = zlib.crc32(source.path.name.encode())
+    rng = np.random.default_rng(derive_seed(seed, number_of_file))
     drawn = random_crops(
         source.points, subject.n_points, subject.crops, subject.crop, rng, source.path
     )
@@ -171,24 +187,30 @@ def _draw(source: Source, subject: Subject, seed: int) -> Batch:
     parts = None
     if source.parts is not None:
         parts = torch.from_numpy(source.parts[drawn.rows])
-    return Batch(points, torch.full((subject.crops,), source.label), None, parts)
+    labels = torch.full((subject.crops,), source.label)
+    return Batch(points, labels, None, parts)
 
 
 def _joined(
     drawn: Sequence[Batch], subject: Subject, seed: int
 ) -> Iterator[tuple[Any, torch.Tensor]]:
     """Put clouds of files together, in batches of ``BATCH``."""
-    points = torch.cat([one.points for one in drawn])
-    labels = torch.cat([one.labels for one in drawn])
-    known = [one.parts for one in drawn if one.parts is not None]
-    parts = torch.cat(known) if known else None
+    points = torch.cat([batch.points for batch in drawn])
+    labels = torch.cat([batch.labels for batch in drawn])
+    known = [batch.parts for batch in drawn if batch.parts is not None]
+    parts = None
+    if known:
+        parts = torch.cat(known)
     for first in range(0, len(points), BATCH):
         of_batch = slice(first, first + BATCH)
         clouds = points[of_batch]
         if subject.task.make_batch is not None:
             places = range(first, first + len(clouds))
-            pairs = subject.task.make_batch(clouds, [generator(seed, place) for place in places])
+            generators = [generator(seed, place) for place in places]
+            pairs = subject.task.make_batch(clouds, generators)
             yield pairs, pairs.points
             continue
-        batch = Batch(clouds, labels[of_batch], None, None if parts is None else parts[of_batch])
-        yield batch, clouds
+        parts_of_batch = None
+        if parts is not None:
+            parts_of_batch = parts[of_batch]
+        yield Batch(clouds, labels[of_batch], None, parts_of_batch), clouds

@@ -82,7 +82,9 @@ def compare_task_net(
         UserError: an argument or a file is invalid.
     """
     check_numbers(points, crops, draws)
-    kept = None if save is None else _free(keep.file_of(str(save)), overwrite)
+    kept = None
+    if save is not None:
+        kept = _free(keep.file_of(str(save)), overwrite)
     if out is not None:
         check_out(Path(out), overwrite, tables.FILES)
     subject = _subject(task_net, loss, points, crops, label)
@@ -97,11 +99,11 @@ def compare_task_net(
             f"got {len(paths)}."
         )
     sources = read_sources(paths, subject, seed, columns)
-    if kept is not None and {source.half for source in sources} != set(HALVES):
+    halves = {source.half for source in sources}
+    if kept is not None and halves != set(HALVES):
         raise UserError("--save needs two files or more of one class.")
-    frame = pd.DataFrame(
-        [asdict(row) for row in score_methods(sources, subject, compared, sizes, draws, seed)]
-    )
+    scores = score_methods(sources, subject, compared, sizes, draws, seed)
+    frame = pd.DataFrame([asdict(score) for score in scores])
     metric = score_of(subject)
     choices: list[keep.Choice] = []
     if kept is not None:
@@ -115,7 +117,9 @@ def compare_task_net(
 
 
 def _paths(files: str | Path | Sequence[str | Path]) -> list[str | Path]:
-    return [files] if isinstance(files, str | Path) else list(files)
+    if isinstance(files, str | Path):
+        return [files]
+    return list(files)
 
 
 def _samplers(
@@ -124,7 +128,13 @@ def _samplers(
     """Return one sampler or several as a list, paths as texts."""
     if isinstance(weights, str | Path | Sampler):
         weights = [weights]
-    return [one if isinstance(one, Sampler) else str(one) for one in weights]
+    samplers: list[str | Sampler] = []
+    for given in weights:
+        if isinstance(given, Sampler):
+            samplers.append(given)
+        else:
+            samplers.append(str(given))
+    return samplers
 
 
 def _free(path: Path, overwrite: bool) -> Path:

@@ -80,7 +80,9 @@ def _training_files(dataset: dict[str, Any]) -> set[Path]:
         if dataset.get("test_frames") == "last":
             split = split_by_time(names, share, dataset.get("gap") or 0)
         else:
-            split = split_by_folder(names) or split_by_share(names, share, dataset.get("seed") or 0)
+            seed = dataset.get("seed") or 0
+            split = split_by_folder(names) or split_by_share(names, share, seed)
     except UserError:  # the folder has changed since
         return set()
-    return {(folder / file.name).resolve() for file in split if file.split == "train"}
+    trained = [file for file in split if file.split == "train"]
+    return {(folder / file.name).resolve() for file in trained}

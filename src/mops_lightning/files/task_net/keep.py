@@ -4,6 +4,7 @@ Methods are chosen on one half of the files. A method other than farthest points
 better than these on the other half, too.
 """
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,7 +49,10 @@ class Choice:
         text = f"{self.m:,} points: {self.method}"
         if self.checked is None:
             return text
-        difference = f"{self.checked} {'better' if self.checked.mean > 0 else 'worse'}"
+        word = "worse"
+        if self.checked.mean > 0:
+            word = "better"
+        difference = f"{self.checked} {word}"
         if self.rejected:
             return f"{text}; {self.rejected} was {difference} on the other half"
         return f"{text}, {difference} than FPS on the other half"
@@ -61,12 +65,11 @@ def by_size(frame: pd.DataFrame, files: str) -> dict[int, dict[str, list[float]]
         frame: columns of ``Score``.
         files: the group of files.
     """
-    scores: dict[int, dict[str, list[float]]] = {}
-    chosen = frame[(frame.files == files) & (frame.method != EVERYTHING)].sort_values(
-        "draw", kind="stable"
-    )
+    scores: dict[int, dict[str, list[float]]] = defaultdict(dict)
+    is_chosen = (frame.files == files) & (frame.method != EVERYTHING)
+    chosen = frame[is_chosen].sort_values("draw", kind="stable")
     for (m, method), group in chosen.groupby(["m", "method"], sort=False):
-        scores.setdefault(int(m), {})[str(method)] = group.score.tolist()
+        scores[int(m)][str(method)] = group.score.tolist()
     return dict(sorted(scores.items()))
 
 
@@ -76,7 +79,8 @@ def by_part(frame: pd.DataFrame) -> dict[int, dict[str, list[float]]]:
     second = by_size(frame, CHECKING)
     parts = {}
     for m, values in first.items():
-        parts[m] = {name: draws + second.get(m, {}).get(name, []) for name, draws in values.items()}
+        others = second.get(m, {})
+        parts[m] = {name: draws + others.get(name, []) for name, draws in values.items()}
     return parts
 
 
@@ -100,7 +104,9 @@ def choose(frame: pd.DataFrame, metric: MetricInfo, methods: Sequence[Method]) -
 
 
 def _is_savable(method: Method) -> bool:
-    return isinstance(method, Untrained) or (isinstance(method, Trained) and bool(method.path))
+    if isinstance(method, Trained):
+        return method.path is not None
+    return isinstance(method, Untrained)
 
 
 def _choice(m: int, first: Values, second: Values, metric: MetricInfo) -> Choice:
@@ -109,7 +115,8 @@ def _choice(m: int, first: Values, second: Values, metric: MetricInfo) -> Choice
     if advice.method in FPS:
         return Choice(m, advice.method)
     rival = better_fps(second, metric)
-    checked = Gain.of(second[advice.method], second[rival], metric)
+    values = second[advice.method]
+    checked = Gain.of(values, second[rival], metric)
     if checked.mean > 0:
         return Choice(m, advice.method, checked=checked)
     return Choice(m, better_fps(first, metric), advice.method, checked)
@@ -130,7 +137,8 @@ def save(path: Path, choices: Sequence[Choice], methods: Sequence[Method], seed:
     by_name = {method.name: method for method in methods}
     # The first one fills in for sizes that were not compared.
     fallback = _fallback(choices)
-    used = list(dict.fromkeys([fallback, *(choice.method for choice in choices)]))
+    chosen = [choice.method for choice in choices]
+    used = list(dict.fromkeys([fallback, *chosen]))
     nodes: list[dict[str, Any]] = []
     samplers: list[nn.Module] = []
     channels = NO_CHANNELS
@@ -145,7 +153,7 @@ def save(path: Path, choices: Sequence[Choice], methods: Sequence[Method], seed:
             nodes.append(method.node(seed))
             samplers.append(method.sampler(1, seed))
     budgets = [choice.m for choice in choices]
-    best = [used.index(choice.method) for choice in choices]
+    best = [used.index(name) for name in chosen]
     module = ByBudget(budgets, best, samplers, channels)  # type: ignore[arg-type]
     node = {
         "_target_": f"{ByBudget.__module__}.{ByBudget.__qualname__}",
@@ -153,7 +161,11 @@ def save(path: Path, choices: Sequence[Choice], methods: Sequence[Method], seed:
         "best": best,
         "samplers": nodes,
     }
-    config = {"learn": "sampler", "sampler": node, "chosen": [choice.line for choice in choices]}
+    config = {
+        "learn": "sampler",
+        "sampler": node,
+        "chosen": [choice.line for choice in choices],
+    }
     weights.save(path, module, config, {}, channels=channels)
 
 

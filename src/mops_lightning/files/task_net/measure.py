@@ -68,13 +68,16 @@ class Tally:
     def __init__(self, subject: Subject) -> None:
         self.net = subject.name
         metrics = subject.task.metrics()
-        self.metric: Metric | None = metrics[subject.task.score] if len(metrics) else None
+        self.metric: Metric | None = None
+        if len(metrics):
+            self.metric = metrics[subject.task.score]
         self.total = 0.0
         self.clouds = 0
 
     def add(self, result: TaskOutput, clouds: int) -> None:
         """Add the result of a batch."""
-        self.total += clouds * float(sum(result.losses.values()))
+        loss = float(sum(result.losses.values()))
+        self.total += clouds * loss
         self.clouds += clouds
         if self.metric is not None:
             self.metric.update(result.predictions, result.targets)
@@ -87,8 +90,12 @@ class Tally:
         """
         method, m = key
         loss = self.total / self.clouds
-        value = loss if self.metric is None else float(self.metric.compute())
-        points = f"{m:,} points by {method}" if m else method
+        value = loss
+        if self.metric is not None:
+            value = float(self.metric.compute())
+        points = method
+        if m:
+            points = f"{m:,} points by {method}"
         for what, number in {"loss": loss, "score": value}.items():
             if not isfinite(number):
                 raise UserError(
@@ -121,7 +128,8 @@ def score_methods(
         UserError: a size is out of range, or the net refuses the points.
     """
     console = Console(stderr=True)
-    numbers = track(range(draws), "Draws", console=console, disable=not console.is_terminal)
+    is_quiet = not console.is_terminal
+    numbers = track(range(draws), "Draws", console=console, disable=is_quiet)
     for draw in numbers:
         seed_of_draw = derive_seed(seed, draw)
         tallies: dict[tuple[str, Key], Tally] = {}
@@ -139,19 +147,26 @@ def score_methods(
 
 
 def _samples(
-    points: torch.Tensor, methods: Sequence[Method], sizes: Sequence[int], seed: int
+    points: torch.Tensor,
+    methods: Sequence[Method],
+    sizes: Sequence[int],
+    seed: int,
 ) -> dict[Key, torch.Tensor]:
     """Return the points that every method chooses, and all points."""
     samples = {(EVERYTHING, 0): points}
     for m in sizes:
         for method in methods:
             if method.takes(m):
-                samples[method.name, m] = gather_points(points, method.rows(points, m, seed))
+                rows = method.rows(points, m, seed)
+                samples[method.name, m] = gather_points(points, rows)
     return samples
 
 
 def _results(
-    subject: Subject, batch: Any, points: torch.Tensor, samples: Mapping[Key, torch.Tensor]
+    subject: Subject,
+    batch: Any,
+    points: torch.Tensor,
+    samples: Mapping[Key, torch.Tensor],
 ) -> dict[Key, TaskOutput]:
     """Return the results of the task net.
 
@@ -163,10 +178,11 @@ def _results(
     except (RuntimeError, IndexError, TypeError) as error:
         if isinstance(error, UserError):
             raise
+        _, number, columns = points.shape
         reason = " ".join(str(error).split())[:200]
         raise UserError(
-            f"--task-net: {subject.name} fails on clouds of {points.shape[1]} points with "
-            f"{points.shape[2]} columns: {reason}"
+            f"--task-net: {subject.name} fails on clouds of {number} points with "
+            f"{columns} columns: {reason}"
         ) from None
 
 

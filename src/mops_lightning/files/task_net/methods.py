@@ -20,7 +20,9 @@ from mops_lightning.zoo import names, weights
 from mops_lightning.zoo.find_sampler import untrained
 from mops_lightning.zoo.load import SEES_CHANNELS, load
 
-FPS_FARTHEST, CRITICAL, TRAINED = "fps_farthest", "critical", "trained"
+FPS_FARTHEST = "fps_farthest"
+CRITICAL = "critical"
+TRAINED = "trained"
 
 NAMES = (*names.UNTRAINED, FPS_FARTHEST, CRITICAL)
 """Methods without training of their own."""
@@ -52,7 +54,8 @@ class Untrained(Method):
 
     def rows(self, clouds: Tensor, m: int, seed: int) -> Tensor:
         """Return the rows of chosen points."""
-        return rows_in_unit_sphere(self.sampler(m, seed), coordinates(clouds), m)
+        sampler = self.sampler(m, seed)
+        return rows_in_unit_sphere(sampler, coordinates(clouds), m)
 
     def sampler(self, m: int, seed: int) -> Sampler:
         """Return the sampler of up to m points."""
@@ -63,7 +66,10 @@ class Untrained(Method):
     def node(self, seed: int) -> dict[str, Any]:
         """Return the sampler as plain data, as ``ByBudget`` files hold it."""
         cls = type(self.sampler(1, seed))
-        node: dict[str, Any] = {"_target_": f"{cls.__module__}.{cls.__qualname__}", "m": MOST}
+        node: dict[str, Any] = {
+            "_target_": f"{cls.__module__}.{cls.__qualname__}",
+            "m": MOST,
+        }
         if self.name not in ("voxel", "serial"):
             node["seed"] = seed
         if self.name == FPS_FARTHEST:
@@ -81,7 +87,8 @@ class Critical(Method):
 
     def rows(self, clouds: Tensor, m: int, seed: int) -> Tensor:
         """Return the rows of chosen points."""
-        return rows_in_unit_sphere(CriticalSampler(m, net=self.net, seed=seed), clouds, m)
+        sampler = CriticalSampler(m, net=self.net, seed=seed)
+        return rows_in_unit_sphere(sampler, clouds, m)
 
 
 class Trained(Method):
@@ -114,23 +121,27 @@ class Trained(Method):
                 raise UserError(f"--weights: {error}") from None
         channels = self.sampler.point_channels
         if channels and channels.names != seen.names:
+            own = ", ".join(channels.names)
+            of_net = ", ".join(seen.names) or "none"
             raise UserError(
-                f"--weights: {name} sees the channels {', '.join(channels.names)}, but the "
-                f"task net sees {', '.join(seen.names) or 'none'}."
+                f"--weights: {name} sees the channels {own}, but the task net sees {of_net}."
             )
 
     def takes(self, m: int) -> bool:
         """Return whether it was trained for m points."""
-        return m <= self.sampler.m if self.sampler.flexible else m == self.sampler.m
+        if self.sampler.flexible:
+            return m <= self.sampler.m
+        return m == self.sampler.m
 
     def rows(self, clouds: Tensor, m: int, seed: int) -> Tensor:
         """Return the rows of chosen points; without any, the channels are its own or none."""
         channels = self.sampler.point_channels
         if not channels:
             return rows_in_unit_sphere(self.sampler, coordinates(clouds), m)
-        values = channels.scaled(self.seen.restored(clouds[..., 3:].double()))
-        own = torch.cat([coordinates(clouds), values.to(clouds.dtype)], -1)
-        return rows_in_unit_sphere(self.sampler, own, m)
+        values = self.seen.restored(clouds[..., 3:].double())
+        own_channels = channels.scaled(values).to(clouds.dtype)
+        own_clouds = torch.cat([coordinates(clouds), own_channels], -1)
+        return rows_in_unit_sphere(self.sampler, own_clouds, m)
 
     def config(self) -> dict[str, Any]:
         """Return the settings of the run that trained it; empty for a sampler in memory."""
@@ -175,12 +186,17 @@ def methods_of(
                 f"which {subject.name} has not."
             )
         if name not in known:
-            raise UserError(f"--methods: unknown {name!r}.{did_you_mean(name, known)}")
+            hint = did_you_mean(name, known)
+            raise UserError(f"--methods: unknown {name!r}.{hint}")
     if chosen is not None:
-        known = [name for name in known if name in chosen or name in ("fps", FPS_FARTHEST)]
+        wanted = {*chosen, "fps", FPS_FARTHEST}
+        known = [name for name in known if name in wanted]
     methods: list[Method] = []
     for name in known:
-        methods.append(Critical(subject.task.net) if name == CRITICAL else Untrained(name))
+        if name == CRITICAL:
+            methods.append(Critical(subject.task.net))
+        else:
+            methods.append(Untrained(name))
     return methods + list(_trained(given, subject, sizes))
 
 
@@ -190,14 +206,14 @@ def _trained(
     if not given and subject.sampler is not None:
         given = [str(subject.sampler)]
     samplers = []
-    for one, name in zip(given, _names(given), strict=True):
-        method = Trained(one, name, subject.channels)
+    for sampler, name in zip(given, _names(given), strict=True):
+        method = Trained(sampler, name, subject.channels)
         if not any(method.takes(m) for m in sizes):
-            most = method.sampler.m
-            allowed = f"up to {most}" if method.sampler.flexible else str(most)
-            raise UserError(
-                f"--m: {name} was trained for {allowed} points, got {', '.join(map(str, sizes))}."
-            )
+            allowed = str(method.sampler.m)
+            if method.sampler.flexible:
+                allowed = f"up to {allowed}"
+            numbers = ", ".join(map(str, sizes))
+            raise UserError(f"--m: {name} was trained for {allowed} points, got {numbers}.")
         samplers.append(method)
     return samplers
 
@@ -206,9 +222,17 @@ def _names(given: Sequence[str | Sampler]) -> list[str]:
     """Return a name for every trained sampler: the last part of its path, or its class."""
     if len(given) == 1:
         return [TRAINED]
-    short = [type(one).__name__ if isinstance(one, Sampler) else Path(one).name for one in given]
+    short = [_short_name(sampler) for sampler in given]
     numbered = []
-    for place, name in enumerate(short):
+    for place, name in enumerate(short, start=1):
         is_unique = short.count(name) == 1 and name not in NAMES
-        numbered.append(name if is_unique else f"{name}_{place + 1}")
+        if not is_unique:
+            name = f"{name}_{place}"
+        numbered.append(name)
     return numbered
+
+
+def _short_name(given: str | Sampler) -> str:
+    if isinstance(given, Sampler):
+        return type(given).__name__
+    return Path(given).name

@@ -49,13 +49,17 @@ class OwnTask(Task):
         """
         output = self.net(points)
         loss = self.loss(output, batch)
-        if not isinstance(loss, Tensor) or loss.shape not in ((), (batch.num_clouds,)):
-            found = tuple(loss.shape) if isinstance(loss, Tensor) else type(loss).__name__
-            raise UserError(
-                f"loss must return one number, or one for each of {batch.num_clouds} clouds, got "
-                f"{found}."
-            )
+        if not isinstance(loss, Tensor):
+            raise self._refused(batch, type(loss).__name__)
+        if loss.shape not in ((), (batch.num_clouds,)):
+            raise self._refused(batch, str(tuple(loss.shape)))
         return TaskOutput({"loss": loss.mean()}, output, None, output)
+
+    def _refused(self, batch: Batch, found: str) -> UserError:
+        return UserError(
+            f"loss must return one number, or one for each of {batch.num_clouds} clouds, got "
+            f"{found}."
+        )
 
     def metrics(self, training: bool = False) -> MetricCollection:
         """Return no metric: the loss is the score."""
@@ -102,7 +106,10 @@ class Subject:
 
 
 def subject_of_run(
-    reference: str, points: int | None, crops: int | None, label: str | None
+    reference: str,
+    points: int | None,
+    crops: int | None,
+    label: str | None,
 ) -> Subject:
     """Return the task of a run, a model or a weights file.
 
@@ -120,11 +127,15 @@ def subject_of_run(
     try:
         trained = read_task(reference)
     except UserError as error:
-        hint = "" if Path(reference).exists() else " A net of your own needs --loss, too."
+        hint = ""
+        if not Path(reference).exists():
+            hint = " A net of your own needs --loss, too."
         raise UserError(f"--task-net: {error}{hint}") from None
     data = trained.config["dataset"]
     # Tiles are neighbourhoods, too, but always the same ones.
-    crop: Crop = "nearest" if data.get("crop") in ("nearest", "tiles") else "whole"
+    crop: Crop = "whole"
+    if data.get("crop") in ("nearest", "tiles"):
+        crop = "nearest"
     subject = Subject(
         name=reference,
         task=trained.task,
@@ -199,15 +210,18 @@ def imported(name: str, option: str) -> Any:
     """
     from hydra.utils import get_object
 
-    if "" not in sys.path and str(Path.cwd()) not in sys.path:
+    folders = sys.path
+    if "" not in folders and str(Path.cwd()) not in folders:
         sys.path.insert(0, "")
     try:
         return get_object(name)
     except Exception as error:
-        reason = str(error.__cause__ or error).strip().splitlines()[-1]
+        lines = str(error.__cause__ or error).strip().splitlines()
+        reason = lines[-1]
         module, _, last = name.rpartition(".")
         if module in sys.modules:  # Hydra then says that the module is no package
-            reason = f"{module} has no {last!r}.{did_you_mean(last, vars(sys.modules[module]))}"
+            hint = did_you_mean(last, vars(sys.modules[module]))
+            reason = f"{module} has no {last!r}.{hint}"
         raise UserError(f"{option}: cannot import {name!r}: {reason}") from None
 
 

@@ -21,7 +21,10 @@ from mops_lightning.report.tables import Cell, Part
 from mops_lightning.report.text import BEST, Grid, markdown
 from mops_lightning.viz.figures import new_figure, save_figure
 
-TABLE, TEXT, CURVE, PAGE = "table.csv", "table.md", "curve.svg", "compare.html"
+TABLE = "table.csv"
+TEXT = "table.md"
+CURVE = "curve.svg"
+PAGE = "compare.html"
 FILES = (TABLE, TEXT, CURVE, PAGE)
 """The files of a comparison."""
 
@@ -63,12 +66,15 @@ class Comparison:
     @property
     def sentence(self) -> str:
         """Which method to use for how many points."""
-        return verdict(by_size(self.frame, ALL), self.metric, self.own, by_part(self.frame))
+        scores = by_size(self.frame, ALL)
+        parts = by_part(self.frame)
+        return verdict(scores, self.metric, self.own, parts)
 
     @property
     def text(self) -> str:
         """The tables, how to read them, what was kept, and the sentence."""
-        return markdown(self._grids(), [*MEANINGS, *self._ending()])
+        remarks = [*MEANINGS, *self._ending()]
+        return markdown(self._grids(), remarks)
 
     def write(self, folder: Path) -> None:
         """Write ``FILES`` to a folder."""
@@ -107,22 +113,28 @@ class Comparison:
         sizes = [m for m in frame.m.unique() if m]
         draws = frame.draw.nunique()
         clouds = frame.clouds.iloc[0]
-        title = (
-            f"{metric.title} of {self.net}: {counted(draws, 'draw')} of {clouds:,} clouds from "
-            f"{counted(self.files, 'file')}"
-        )
+        draws_of_clouds = f"{counted(draws, 'draw')} of {clouds:,} clouds"
+        files = counted(self.files, "file")
+        title = f"{metric.title} of {self.net}: {draws_of_clouds} from {files}"
         best = {m: _best(frame[frame.m == m], column, metric) for m in sizes}
         rows: list[list[str | Cell]] = []
         for method in frame.method.unique():
             of_method = frame[frame.method == method]
             row: list[str | Cell] = [method]
             for m in sizes:
-                values = of_method[of_method.m == (0 if method == EVERYTHING else m)][column]
-                rank = BEST if method in best[m] else 0
+                size = m
+                if method == EVERYTHING:
+                    size = 0
+                rank = 0
+                if method in best[m]:
+                    rank = BEST
+                values = of_method[of_method.m == size][column]
                 row.append(_cell(values.tolist(), metric, rank))
             rows.append(row)
         rows.sort(key=lambda row: row[0] == EVERYTHING)
-        return Grid(title, ["method", *(f"m={m:,}" for m in sizes)], rows)
+        head = ["method"]
+        head += [f"m={m:,}" for m in sizes]
+        return Grid(title, head, rows)
 
     def _curve(self) -> Figure:
         """Draw the score against the number of points."""
@@ -130,23 +142,29 @@ class Comparison:
         sizes = list(scores)
         figure = new_figure(7.5, 4.2)
         axis = figure.subplots()
-        names = list(dict.fromkeys(name for values in scores.values() for name in values))
+        names: dict[str, None] = {}
+        for values in scores.values():
+            names |= dict.fromkeys(values)
         scale = self.metric.scale
         for number, name in enumerate(names):
             known = [m for m in sizes if name in scores[m]]
+            style = "--"
+            if name in self.own:
+                style = "-"
             axis.errorbar(
                 [sizes.index(m) for m in known],
                 [scale * fmean(scores[m][name]) for m in known],
                 yerr=[scale * _spread(scores[m][name]) for m in known],
                 label=name,
                 color=COLOURS[number % len(COLOURS)],
-                linestyle="-" if name in self.own else "--",
+                linestyle=style,
                 marker="o",
                 markersize=3,
                 capsize=2,
             )
-        whole = self.frame[(self.frame.files == ALL) & (self.frame.method == EVERYTHING)]
-        axis.axhline(scale * whole.score.mean(), color="grey", linewidth=0.8, label=EVERYTHING)
+        is_whole = (self.frame.files == ALL) & (self.frame.method == EVERYTHING)
+        of_whole = scale * self.frame[is_whole].score.mean()
+        axis.axhline(of_whole, color="grey", linewidth=0.8, label=EVERYTHING)
         axis.set_xticks(range(len(sizes)), [f"{m:,}" for m in sizes])
         axis.set(xlabel="points", ylabel=self.metric.title)
         axis.grid(alpha=0.3)
@@ -157,12 +175,17 @@ class Comparison:
 def _best(frame: pd.DataFrame, column: str, metric: MetricInfo) -> set[str]:
     """Return the method with the best mean, or all methods that share it."""
     means = frame.groupby("method", sort=False)[column].mean()
-    best = means.max() if metric.higher_is_better else means.min()
-    return set(means.index[means == best])
+    best = means.min()
+    if metric.higher_is_better:
+        best = means.max()
+    is_best = means == best
+    return set(means.index[is_best])
 
 
 def _spread(values: Sequence[float]) -> float:
-    return stdev(values) if len(values) > 1 else 0.0
+    if len(values) == 1:
+        return 0.0
+    return stdev(values)
 
 
 def _cell(values: Sequence[float], metric: MetricInfo, rank: int) -> str | Cell:
@@ -173,7 +196,8 @@ def _cell(values: Sequence[float], metric: MetricInfo, rank: int) -> str | Cell:
     mean = format(metric.scale * fmean(values), form)
     if len(values) == 1:
         return Cell((Part(mean, rank),))
-    return Cell((Part(mean, rank),), f" ± {format(metric.scale * stdev(values), form)}")
+    deviation = format(metric.scale * stdev(values), form)
+    return Cell((Part(mean, rank),), f" ± {deviation}")
 
 
 def _form(metric: MetricInfo, mean: float) -> str:
@@ -181,4 +205,6 @@ def _form(metric: MetricInfo, mean: float) -> str:
     if metric.unit or not mean:
         return ".2f"
     decimals = 3 - floor(log10(abs(mean)))
-    return f".{max(decimals, 0)}f" if decimals < 7 else ".2e"
+    if decimals >= 7:
+        return ".2e"
+    return f".{max(decimals, 0)}f"
