@@ -116,11 +116,7 @@ def sample_by_chunks(
         dropped = file.number - number
     outcome = Outcome(m, number, dropped)
     if options.readout == "generated":
-        columns: Mapping[str, Column] = {}
-        if sampler.point_channels and not options.coordinates_only:
-            example = cloud.read(row_ranges[0])
-            channels = generated[:, 3:]
-            columns = generated_columns(example, sampler.point_channels, channels)
+        columns = _generated_columns(cloud, row_ranges[0], sampler, generated, options)
         return Table(sphere.restore(places), columns, file.header), outcome
     parts = over("matching", _nearest, sphere, places)
     matched: Nearest = reduce(Nearest.merge, parts)
@@ -128,6 +124,20 @@ def sample_by_chunks(
     if options.coordinates_only:
         kept = kept.without_attributes()
     return kept, outcome
+
+
+def _generated_columns(
+    cloud: CloudFile,
+    rows: range,
+    sampler: Sampler,
+    generated: Tensor,
+    options: Options,
+) -> Mapping[str, Column]:
+    """Return the channels of generated points, named and typed as in some rows of the file."""
+    if options.coordinates_only or not sampler.point_channels:
+        return {}
+    channels = generated[:, 3:]
+    return generated_columns(cloud.read(rows), sampler.point_channels, channels)
 
 
 OverSeen = Callable[[str, Callable[[Tensor], Any]], Iterable[Any]]

@@ -109,21 +109,25 @@ def propagation_map(
         raise UserError(
             f"points and sampled must have as many clouds, got {len(clouds)} and {len(samples)}."
         )
-    all_rows = []
-    all_weights = []
+    pairs = zip(clouds, samples, strict=True)
+    near = [_search(cloud, sample, k) for cloud, sample in pairs]
+    weights = [weights_of_cloud for _, weights_of_cloud in near]
+    if not is_flat:
+        rows = torch.stack([rows_in_sample for rows_in_sample, _ in near])
+        return PropagationMap(rows, torch.stack(weights), sampled.shape[1])
+    starts = _starts_of([len(sample) for sample in samples])
+    all_rows = [rows + start for (rows, _), start in zip(near, starts, strict=True)]
+    return PropagationMap(torch.cat(all_rows), torch.cat(weights), len(sampled))
+
+
+def _starts_of(sizes: list[int]) -> list[int]:
+    """Return the row at which every cloud begins in one tensor of all clouds."""
+    starts = []
     start = 0
-    for cloud, sample in zip(clouds, samples, strict=True):
-        rows, weights = _search(cloud, sample, k)
-        all_rows.append(rows + start)
-        all_weights.append(weights)
-        if is_flat:
-            start += len(sample)
-    if is_flat:
-        rows_of_all = torch.cat(all_rows)
-        weights_of_all = torch.cat(all_weights)
-        return PropagationMap(rows_of_all, weights_of_all, len(sampled))
-    m = sampled.shape[1]
-    return PropagationMap(torch.stack(all_rows), torch.stack(all_weights), m)
+    for size in sizes:
+        starts.append(start)
+        start += size
+    return starts
 
 
 def _check_kind(name: str, points: Tensor, ndim: int) -> None:
@@ -295,13 +299,7 @@ def propagate(values: Any, map: Any, mean: bool = False, fill: Any = None) -> An
     shape_of_value = numbers.shape[map.rows.ndim - 1 :]
     table = numbers.reshape(-1, *shape_of_value)
     weights = map.weights.to(numbers.device).reshape(rows.shape)
-    if rows.shape[1] == 1:
-        nearest_rows = rows[:, 0]
-        result = _signed(table)[nearest_rows].view(table.dtype)
-    elif mean or table.is_floating_point():
-        result = _mean(table, rows, weights)
-    else:
-        result = _vote(table, rows, weights)
+    result = _of_neighbours(table, rows, weights, mean)
     if has_missing:
         value = _fill_value(fill, table.dtype).to(table.device)
         _signed(result)[is_missing] = _signed(value)
@@ -309,6 +307,16 @@ def propagate(values: Any, map: Any, mean: bool = False, fill: Any = None) -> An
     if isinstance(values, Tensor):
         return result
     return result.numpy()
+
+
+def _of_neighbours(table: Tensor, rows: Tensor, weights: Tensor, mean: bool) -> Tensor:
+    """Return the value, the mean or the vote of every point's neighbours."""
+    if rows.shape[1] == 1:
+        nearest_rows = rows[:, 0]
+        return _signed(table)[nearest_rows].view(table.dtype)
+    if mean or table.is_floating_point():
+        return _mean(table, rows, weights)
+    return _vote(table, rows, weights)
 
 
 def interpolate(values: Tensor, points: Tensor, queries: Tensor, k: int = 3) -> Tensor:

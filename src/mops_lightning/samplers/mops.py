@@ -96,15 +96,7 @@ class MOPSNet(Sampler):
         check_channels("rho_channels", rho_channels)
         if anchors not in (None, "fps"):
             raise UserError(f"anchors must be fps or null, got {anchors!r}.")
-        if not 0 < anchor_width <= MAX_WIDTH:
-            raise UserError(
-                f"anchor_width must be above 0 and at most {MAX_WIDTH}, got {anchor_width}."
-            )
-        if anchors is None and anchor_width != DEFAULT_WIDTH:
-            raise UserError(
-                f"anchor_width has no effect without anchors=fps, got {anchor_width}. Add "
-                f"anchors=fps, or set anchor_width={DEFAULT_WIDTH}."
-            )
+        check_width(anchors, anchor_width)
         check_local(anchors, candidates=candidates, neighbours=neighbours)
         if not 0 <= threshold < 1:
             raise UserError(f"threshold must be at least 0 and below 1, got {threshold}.")
@@ -241,6 +233,19 @@ class MOPSNet(Sampler):
             for m, loss in overlap_losses(output.matrix, sizes).items():
                 losses[m]["overlap"] = self.overlap * loss
         return losses
+
+
+def check_width(anchors: str | None, anchor_width: float) -> None:
+    """Check the width of anchors, which has no effect without them."""
+    if not 0 < anchor_width <= MAX_WIDTH:
+        raise UserError(
+            f"anchor_width must be above 0 and at most {MAX_WIDTH}, got {anchor_width}."
+        )
+    if anchors is None and anchor_width != DEFAULT_WIDTH:
+        raise UserError(
+            f"anchor_width has no effect without anchors=fps, got {anchor_width}. Add "
+            f"anchors=fps, or set anchor_width={DEFAULT_WIDTH}."
+        )
 
 
 def check_local(anchors: str | None, **settings: int | None) -> None:
