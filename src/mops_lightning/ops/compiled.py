@@ -96,15 +96,20 @@ def nearest(queries: Tensor, points: Tensor, k: int) -> Tensor | None:
     """
     if points.device.type != "cpu":
         return None
+    if points.numel() == 0 or queries.numel() == 0:
+        return None
     if k > 1:
         return _several_nearest(queries, points, k)
-    planes, (clouds, n, channels) = _planes(points), points.shape
+    clouds, n, channels = points.shape
+    planes = _planes(points)
     flat = queries.detach().to(distance_dtype(points)).contiguous().flatten(1).numpy()
     scratch = np.empty((clouds, n), _integer(planes))
-    parts, fixed = zip(planes, flat, scratch, strict=True), (channels, NEAREST_LEAF)
+    one_each = zip(planes, flat, scratch, strict=True)
     work = NEAREST_LEAF * (n + queries.shape[1]) * clouds
-    rows = _rows(lambda cloud: kernels.nearest(*cloud, *fixed), parts, work)
-    return None if rows is None else rows[..., None]
+    rows = _rows(lambda cloud: kernels.nearest(*cloud, channels, NEAREST_LEAF), one_each, work)
+    if rows is None:
+        return None
+    return rows[..., None]
 
 
 def _several_nearest(queries: Tensor, points: Tensor, k: int) -> Tensor | None:
@@ -124,7 +129,9 @@ def _several_nearest(queries: Tensor, points: Tensor, k: int) -> Tensor | None:
         return is_finite
 
     are_finite = _in_threads(search, clouds, work=points.shape[1] * m * clouds)
-    return rows if all(are_finite) else None
+    if not all(are_finite):
+        return None
+    return rows
 
 
 def winners(features: Tensor, rows: Tensor) -> Tensor | None:
@@ -139,24 +146,30 @@ def winners(features: Tensor, rows: Tensor) -> Tensor | None:
     """
     if features.device.type != "cpu" or features.numel() == 0:
         return None
-    largest = torch.empty(*rows.shape[:2], features.shape[2], dtype=torch.int64)
+    if features.dtype.itemsize < 4:
+        return None
+    clouds, m, _ = rows.shape
+    largest = torch.empty(clouds, m, features.shape[2], dtype=torch.int64)
     arrays = [part.detach().contiguous().numpy() for part in (features, rows, largest)]
 
     def search(part: slice) -> None:
         kernel_neighbours.winners(*(array[part] for array in arrays))
 
-    _in_threads(search, len(features), work=rows.numel() * features.shape[2])
+    _in_threads(search, clouds, work=rows.numel() * features.shape[2])
     return largest
 
 
 def _in_threads(function: Callable[[slice], Any], clouds: int, work: int) -> list[Any]:
     """Call a function for parts of the clouds, in threads where that is faster."""
-    workers = min(torch.get_num_threads(), clouds) if work >= THREADS_MIN_WORK else 1
+    workers = 1
+    if work >= THREADS_MIN_WORK:
+        workers = min(torch.get_num_threads(), clouds)
     if workers == 1:
         return [function(slice(0, clouds))]
     parts = np.array_split(np.arange(clouds), workers)
+    slices = [slice(part[0], part[-1] + 1) for part in parts]
     with ThreadPoolExecutor(workers) as pool:
-        return list(pool.map(function, [slice(part[0], part[-1] + 1) for part in parts]))
+        return list(pool.map(function, slices))
 
 
 def _planes(points: Tensor) -> Array:

@@ -64,7 +64,8 @@ def k_nearest(queries: Tensor, points: Tensor, k: int) -> tuple[Tensor, Tensor]:
         UserError: the shapes do not match, or k is out of range.
     """
     indices = k_nearest_rows(queries, points, k)
-    differences = queries[:, :, None] - gather_points(points, indices)
+    neighbours = gather_points(points, indices)
+    differences = queries[:, :, None] - neighbours
     return differences.square().sum(3), indices
 
 
@@ -72,8 +73,9 @@ def k_nearest(queries: Tensor, points: Tensor, k: int) -> tuple[Tensor, Tensor]:
 def k_nearest_rows(queries: Tensor, points: Tensor, k: int) -> Tensor:
     """Return the indices of ``k_nearest`` alone; arguments and errors as there."""
     _check_shapes(queries, points)
-    if not 1 <= k <= points.shape[1]:
-        raise UserError(f"k must be from 1 to the number of points N={points.shape[1]}, got {k}.")
+    number = points.shape[1]
+    if not 1 <= k <= number:
+        raise UserError(f"k must be from 1 to the number of points N={number}, got {k}.")
     return _search(queries, points, k)
 
 
