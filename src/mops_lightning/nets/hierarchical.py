@@ -134,7 +134,8 @@ def root_mean_square(offset_moments: Tensor) -> Tensor:
     Args:
         offset_moments: ``(B, M, 12)`` from ``neighbourhood_moments``.
     """
-    squares = offset_moments[..., 3:].unflatten(2, (3, 3)).diagonal(dim1=2, dim2=3).sum(2)
+    products = offset_moments[..., 3:].unflatten(2, (3, 3))
+    squares = products.diagonal(dim1=2, dim2=3).sum(2)
     mean = squares.mean(1)[:, None, None]
     return torch.where(mean > 0, mean, 1.0).sqrt()  # all points may coincide
 
@@ -201,7 +202,8 @@ class Hierarchy(nn.Module):
         if "m_max" in accepted:
             size = "m_max"
         first = channels[0]
-        self.stem = PointMLP([3 + len(self.point_channels), first, first])
+        input_channels = 3 + len(self.point_channels)
+        self.stem = PointMLP([input_channels, first, first])
         stages = []
         for m, (before, after) in zip(points, pairwise(channels), strict=True):
             settings = {size: m}

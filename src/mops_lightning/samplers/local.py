@@ -99,10 +99,13 @@ class LocalAnchors(FPSAnchors):
         sharpness = self._sharpness(thinned.unit, m)
         if self.neighbours is None:
             apart = candidates[:, None] - anchors[:, :, None]
-            logits = content @ keys.mT - sharpness[..., None] * apart.square().sum(3)
+            squares = apart.square().sum(3)
+            logits = content @ keys.mT - sharpness[..., None] * squares
             weights = (logits / tau).softmax(2)
-            return LocalMatrix(weights, thinned.rows[:, None].expand_as(weights), points.shape[1])
-        near = nearest_rows(anchors, candidates, min(self.neighbours, candidates.shape[1]))
+            rows = thinned.rows[:, None].expand_as(weights)
+            return LocalMatrix(weights, rows, points.shape[1])
+        k = min(self.neighbours, candidates.shape[1])
+        near = nearest_rows(anchors, candidates, k)
         entries = Entries(candidates, thinned.anchors, near)
         weights = column_weights(content, keys, entries, sharpness, tau)
         rows = thinned.rows.gather(1, near.flatten(1)).view_as(near)
@@ -142,5 +145,6 @@ class LocalAnchors(FPSAnchors):
 
     def _sharpness(self, unit: Tensor, m: int) -> Tensor:
         """Return 1/s_j² ``(B, m)``."""
-        width = unit[:, None] * self.log_width[:m].to(unit.dtype).mul(2).exp()
+        log_width = self.log_width[:m].to(unit.dtype)
+        width = unit[:, None] * log_width.mul(2).exp()
         return width.clamp_min(SMALLEST**2).reciprocal()

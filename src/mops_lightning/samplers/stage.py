@@ -92,13 +92,16 @@ class StageMOPSNet(MOPSNet):
         """Generate m of the points ``(B, N, 3)`` with features ``(B, N, channels)``; no losses."""
 
         def keys_of(candidates: Tensor, rows: Tensor) -> Tensor:
-            everything = rows.shape[1] == features.shape[1]
-            return self._keys_from(features if everything else gather_points(features, rows))
+            chosen = features
+            if rows.shape[1] < features.shape[1]:
+                chosen = gather_points(features, rows)
+            return self._keys_from(chosen)
 
         assert isinstance(self.queries, LocalAnchors)
         with restrict_autocast_to_pointwise(points.device.type):
             matrix = self.queries.local_matrix(points, keys_of, m, self.tau)
-            sampled = matrix.sample(points.to(matrix.dtype)).to(points.dtype)
+            sampled = matrix.sample(points.to(matrix.dtype))
+            sampled = sampled.to(points.dtype)
         return SampleOutput(sampled, None, {}, matrix)
 
     def losses_in_stage(self, output: SampleOutput, squares: Tensor) -> dict[str, Tensor]:
@@ -111,7 +114,8 @@ class StageMOPSNet(MOPSNet):
         losses = {"subset": self.alpha * squares.mean()}
         if self.overlap and output.matrix is not None:
             m = squares.shape[1]
-            losses["overlap"] = self.overlap * overlap_losses(output.matrix, [m])[m]
+            overlap = overlap_losses(output.matrix, [m])[m]
+            losses["overlap"] = self.overlap * overlap
         return losses
 
     def _keys_from(self, local: Tensor) -> Tensor:
@@ -120,17 +124,18 @@ class StageMOPSNet(MOPSNet):
         if not is_plain and pointwise_autocast_dtype() is None:
             return self._keys_without_gradients(local)
         with pointwise_autocast(local.device.type):
-            hidden = self.rho_local(local).add_(self.rho_global(local.amax(1))[:, None])
+            of_cloud = self.rho_global(local.amax(1))
+            hidden = self.rho_local(local).add_(of_cloud[:, None])
             rows = self.rho_first(hidden.flatten(0, 1))
-        return rows.to(self.queries.weight).unflatten(0, local.shape[:2])
+        keys = rows.to(self.queries.weight)
+        return keys.unflatten(0, local.shape[:2])
 
     def _keys_without_gradients(self, local: Tensor) -> Tensor:
         """Return the same keys with BatchNorm fused into the layers, which takes half the time."""
         norm = self.rho_first[0]
         assert isinstance(norm, nn.BatchNorm1d)
         of_points = fused_layer(self.rho_local, norm)
-        of_cloud = F.linear(
-            local.amax(1), fused_layer(self.rho_global, norm).weight, of_points.bias
-        )
+        global_layer = fused_layer(self.rho_global, norm)
+        of_cloud = F.linear(local.amax(1), global_layer.weight, of_points.bias)
         hidden = F.linear(local, of_points.weight).add_(of_cloud[:, None])
         return hidden.relu_().to(self.queries.weight)

@@ -51,7 +51,8 @@ def as_trained(cfg: DictConfig, trained: TrainedRun, arguments: list[str]) -> Di
         is_about_change = text.startswith(tuple(changed))
         if is_about_change:
             raise
-        raise UserError(f"{EVALUATE}: the record of {trained.name}: {text}") from None
+        whole = f"{EVALUATE}: the record of {trained.name}: {text}"
+        raise UserError(whole) from None
     if not trained.trained_task_net:
         _check_sampler(sampler, _plain(merged.sampler), trained.name)
     return merged
@@ -151,7 +152,8 @@ def _check_trusted(recorded: dict[str, Any], trained: TrainedRun) -> None:
         UserError: there is one.
     """
     for path, value in recorded.items():
-        has_plain_names = all(PLAIN_NAME.fullmatch(part) for part in path.split("."))
+        names = path.split(".")
+        has_plain_names = all(PLAIN_NAME.fullmatch(name) for name in names)
         if not has_plain_names or _names_code(value):
             raise trained.not_accepted(path)
 
@@ -226,7 +228,8 @@ def _names_code(value: Any) -> bool:
     """Return whether a value holds a special key such as ``_target_``, or an interpolation."""
     if isinstance(value, dict):
         has_special_key = any(str(key).startswith("_") for key in value)
-        return has_special_key or any(_names_code(item) for item in value.values())
+        has_code = any(_names_code(item) for item in value.values())
+        return has_special_key or has_code
     if isinstance(value, list):
         return any(_names_code(item) for item in value)
     return _is_interpolation(value)

@@ -103,15 +103,15 @@ class Experiment(L.LightningModule):
         self.test_logger = test_logger
         for module in self._frozen():
             module.requires_grad_(False)
-        size_of_sampler = 0 if sampler is None else sampler.m
-        self.m: int = m or size_of_sampler
+        self.m: int = m or _size_of(sampler)
         self.sizes = tuple(sizes or (self.m,))
         self.prefixes = dict.fromkeys(self.sizes, "")
         if len(self.sizes) > 1:
             self.prefixes = {size: size_prefix(size) for size in self.sizes}
         self.main_readout, *others = names_of_readouts(sampler)
         self.score_name = self._score_name()
-        names = dict.fromkeys([self.main_readout, *others, *self.baselines, FULL])
+        names = dict.fromkeys([self.main_readout, *others])
+        names |= dict.fromkeys([*self.baselines, FULL])
         self.scores = Scores(task.metrics, names, self.prefixes.values())
         self.train_scores = task.metrics(training=True)
         self.train()
@@ -159,7 +159,8 @@ class Experiment(L.LightningModule):
         if self.make_schedule is None:
             return optimizer
         schedule = self.make_schedule(optimizer, total_steps=self.total_steps)
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+        per_step = {"scheduler": schedule, "interval": "step"}
+        return {"optimizer": optimizer, "lr_scheduler": per_step}
 
     def _learned(self) -> list[dict[str, Any]]:
         """Return the parameters that learn as groups of an optimizer, by module."""
@@ -245,7 +246,8 @@ class Experiment(L.LightningModule):
             outputs = self._sample(seen, sizes)
             terms: dict[str, list[Tensor]] = defaultdict(list)
             for m in sizes:
-                for name, value in self._losses(batch, seen, outputs[m], targets).items():
+                losses_of_size = self._losses(batch, seen, outputs[m], targets)
+                for name, value in losses_of_size.items():
                     terms[name].append(value)
             losses = self._over_sizes(terms, len(sizes))
             total = torch.stack(list(losses.values())).sum()
@@ -253,7 +255,8 @@ class Experiment(L.LightningModule):
         readout = self.main_readout
         if outputs[sizes[0]].soft_projected is not None:
             readout = PROJECTED
-        self._log_training({**losses, "total": total}, readout, len(batch.points))
+        logged = {**losses, "total": total}
+        self._log_training(logged, readout, len(batch.points))
         return total
 
     def _over_sizes(self, terms: Mapping[str, list[Tensor]], sizes: int) -> dict[str, Tensor]:
@@ -263,8 +266,9 @@ class Experiment(L.LightningModule):
             terms: the values of every term; a sampler may have one at some sizes only.
             sizes: their number.
         """
-        is_mean = self.sampler is not None and self.sampler.size_reduction == "mean"
-        share = 1 / sizes if is_mean else 1.0
+        share = 1.0
+        if self.sampler is not None and self.sampler.size_reduction == "mean":
+            share = 1 / sizes
         losses = {}
         for name, values in terms.items():
             losses[name] = torch.stack(values).sum() * share
@@ -312,7 +316,11 @@ class Experiment(L.LightningModule):
         for name, value in losses.items():
             self.log(f"train/loss/{name}", value.detach(), batch_size=clouds, sync_dist=True)
         total = losses["total"].detach()
-        over_epoch: dict[str, Any] = {"on_step": False, "on_epoch": True, "batch_size": clouds}
+        over_epoch: dict[str, Any] = {
+            "on_step": False,
+            "on_epoch": True,
+            "batch_size": clouds,
+        }
         self.log("loss", total, prog_bar=True, logger=False, batch_size=clouds)
         self.log("train/mean_loss", total, sync_dist=True, **over_epoch)
         tau: Any = getattr(self.sampler, "tau", None)  # not every sampler has a temperature
@@ -341,7 +349,8 @@ class Experiment(L.LightningModule):
                     samples[m].setdefault(name, output.points)
             sets = {prefix: samples[m] for m, prefix in self.prefixes.items()}
             # The same for all sizes; without a sampler, the full clouds are in it already.
-            sets[""] = {**sets.get("", {}), FULL: batch.points}
+            of_all_sizes = sets.get("", {})
+            sets[""] = {**of_all_sizes, FULL: batch.points}
             self._score(TEST, batch, sets)
             self._score_sets(TEST, self.prefixes, batch.points, outputs)
 
@@ -359,15 +368,18 @@ class Experiment(L.LightningModule):
         for prefix, by_readout in sets.items():
             for readout, points in by_readout.items():
                 samples[prefix, readout] = points
-        for (prefix, readout), result in self.task.scores(batch, samples).items():
-            for name, metric in self.scores.update_readout(f"{prefix}{readout}", result).items():
+        results = self.task.scores(batch, samples)
+        for (prefix, readout), result in results.items():
+            updated = self.scores.update_readout(f"{prefix}{readout}", result)
+            for name, metric in updated.items():
                 self.log(f"{stage}{name}", metric, **logged)
             if readout != self.main_readout:
                 continue
             for name, value in result.losses.items():
                 key = f"{stage}{prefix}loss/{name}"
                 mean = self.scores.update_loss(key, value, clouds)
-                self.log(key, mean, metric_attribute=f"scores.losses.{key}", **logged)
+                attribute = f"scores.losses.{key}"
+                self.log(key, mean, metric_attribute=attribute, **logged)
 
     def _logs(self, stage: str) -> bool | None:
         """Return whether the metrics of a stage go to the loggers; None: if there is one."""
@@ -386,9 +398,16 @@ class Experiment(L.LightningModule):
         if self.sampler is None:
             return
         logs = self._logs(stage)
+        clouds = len(points)
         updated = self.scores.update_sets(points, outputs, self.sampler.nested, prefixes)
         for name, metric in updated.items():
-            self.log(f"{stage}{name}", metric, batch_size=len(points), logger=logs)
+            self.log(f"{stage}{name}", metric, batch_size=clouds, logger=logs)
+
+
+def _size_of(sampler: Sampler | None) -> int:
+    if sampler is None:
+        return 0
+    return sampler.m
 
 
 def _dtype(module: nn.Module) -> torch.dtype:

@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 
 
 def downsample(
-    points: Any, size: Size | Any, seed: int, start: int | str | None
+    points: Any,
+    size: Size | Any,
+    seed: int,
+    start: int | str | None,
 ) -> tuple[Any, Any] | None:
     """Choose farthest points of one cloud or a batch.
 
@@ -37,15 +40,20 @@ def downsample(
         return None
     number = array.shape[-2]
     m = number_of(size, number)
-    if not 1 <= m <= number or len(array) == 0 or not _is_start(start, number):
+    has_size = len(array) > 0 and 1 <= m <= number
+    if not has_size or not _is_start(start, number):
         return None
     is_one = array.ndim == 2
-    clouds = array[None] if is_one else array
+    clouds = array
+    if is_one:
+        clouds = array[None]
     order = SeededOrder(seed, True)
     chosen = rows_from_start(clouds, m, order, start, threads=number_of_threads())
     if chosen is None:
         return None
-    rows = chosen[0] if is_one else chosen
+    rows = chosen
+    if is_one:
+        rows = chosen[0]
     if isinstance(points, np.ndarray):
         return _gathered(array, rows), rows
     return _tensors(points, rows)
@@ -79,7 +87,8 @@ def _is_start(start: Any, number: int) -> bool:
     """Return whether a first point is valid, of so many points."""
     if isinstance(start, int) and not isinstance(start, bool):
         return 0 <= start < number
-    return start is None or (isinstance(start, str) and start == FARTHEST)
+    is_word = isinstance(start, str) and start == FARTHEST
+    return start is None or is_word
 
 
 def _gathered(array: NDArray[Any], rows: NDArray[np.int64]) -> NDArray[Any]:
@@ -94,5 +103,6 @@ def _tensors(points: "Tensor", rows: NDArray[np.int64]) -> "tuple[Tensor, Tensor
     indices = torch.from_numpy(rows)
     if points.ndim == 2:
         return points.detach()[indices], indices
-    places = indices[..., None].expand(-1, -1, points.shape[2])
+    width = points.shape[2]
+    places = indices[..., None].expand(-1, -1, width)
     return points.detach().gather(1, places), indices

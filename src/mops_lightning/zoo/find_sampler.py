@@ -14,7 +14,11 @@ from mops_lightning.zoo.load import load
 
 
 def find_sampler(
-    method: str | Path, m: int, points: Any, start: int | str | None, seed: int | None
+    method: str | Path,
+    m: int,
+    points: Any,
+    start: int | str | None,
+    seed: int | None,
 ) -> Sampler:
     """Return the sampler of a method, or of a model on the device of the points."""
     name = str(method)
@@ -41,9 +45,11 @@ def _model(name: str, device: str) -> Sampler:
         UserError: there is no such method or model.
     """
     known = {*names.UNTRAINED, *names.available()}
-    is_known = name in known or addresses.is_address(name) or Path(name).expanduser().exists()
+    is_file = Path(name).expanduser().exists()
+    is_known = name in known or addresses.is_address(name) or is_file
     if not name or not is_known:
-        raise UserError(f"method: unknown {name!r}.{did_you_mean(name, known)}")
+        hint = did_you_mean(name, known)
+        raise UserError(f"method: unknown {name!r}.{hint}")
     path = weights.of_run(names.resolve(name))
     if not path.is_file():
         raise UserError(f"method: {name!r} holds no weights: there is no {path}.")

@@ -106,7 +106,8 @@ def draw_points(batch: Batch | PairBatch, n: int) -> Tensor:
     if n >= points.shape[1]:
         return points
     clouds = batch.num_clouds
-    rows = torch.rand(clouds, points.shape[1], device=points.device).topk(n).indices
+    numbers = torch.rand(clouds, points.shape[1], device=points.device)
+    rows = numbers.topk(n).indices
     rows = rows.repeat(len(points) // clouds, 1)
     return gather_points(points, rows)
 

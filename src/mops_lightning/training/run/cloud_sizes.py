@@ -12,7 +12,9 @@ from mops_lightning.errors import UserError
 
 def check_processes(dataset: CloudDataset, processes: int) -> None:
     """Refuse clouds of different sizes for several processes, which share every batch."""
-    differ = dataset.train.sizes is not None or dataset.test.sizes is not None
+    has_train_sizes = dataset.train.sizes is not None
+    has_test_sizes = dataset.test.sizes is not None
+    differ = has_train_sizes or has_test_sizes
     if differ and processes > 1:
         raise UserError(
             f"trainer.devices must be 1 with clouds of different sizes, got {processes}. Or set "
@@ -25,5 +27,7 @@ def smallest_cloud(splits: Sequence[Clouds], make_batch: MakeBatch | None) -> Te
     smallest = min(splits, key=lambda clouds: clouds.smallest[1])
     # Pairs may have fewer points than the clouds they are drawn from.
     loader = CloudLoader(smallest, 1, make_batch=make_batch)
-    cloud: Tensor = loader.batch_of(torch.tensor([smallest.smallest[0]])).points[:1]
+    row, _ = smallest.smallest
+    batch = loader.batch_of(torch.tensor([row]))
+    cloud: Tensor = batch.points[:1]
     return cloud

@@ -85,4 +85,5 @@ def note_evaluated(name: str, trained: RunRecord, record: RunRecord) -> None:
     """
     reasons = [reason for reason in trained.partial if not reason.startswith(OF_TEST)]
     if reasons:
-        record.partial.append(f"tested {name}, which was {' and '.join(reasons)}")
+        how = " and ".join(reasons)
+        record.partial.append(f"tested {name}, which was {how}")

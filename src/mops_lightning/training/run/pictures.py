@@ -58,7 +58,9 @@ class CloudVisualization(Callback):
         colour: str | None = None,
         channels: PointChannels = NO_CHANNELS,
     ) -> None:
-        axis = "y" if isinstance(up, bool) else up
+        axis = "y"
+        if not isinstance(up, bool):
+            axis = up
         if axis not in drawing.VIEWS:
             raise UserError(f"up must be x, y or z (the vertical axis), got {up!r:.99}.")
         if colour is not None and not channels:
@@ -67,9 +69,12 @@ class CloudVisualization(Callback):
                 "gives them channels."
             )
         if colour is not None and colour not in channels.names:
-            raise UserError(f"colour: no channel {colour!r}.{did_you_mean(colour, channels.names)}")
+            hint = did_you_mean(colour, channels.names)
+            raise UserError(f"colour: no channel {colour!r}.{hint}")
         self.up = axis
-        self.channel = None if colour is None else 3 + channels.names.index(colour)
+        self.channel = None
+        if colour is not None:
+            self.channel = 3 + channels.names.index(colour)
         self.batch = batch
         self.titles = list(titles)
         self.folder = folder / "pictures"
@@ -102,7 +107,8 @@ class CloudVisualization(Callback):
                 board.add_clouds(points, samples, trainer.global_step)
         for name, figure in drawn.figures.items():
             drawing.view_upright(figure, self.up)
-            path = drawing.save_figure(figure, self.folder / f"{name}.png")
+            path = self.folder / f"{name}.png"
+            drawing.save_figure(figure, path)
             if board is not None:  # it shows the saved file: a second drawing takes as long
                 pixels = np.asarray(Image.open(path).convert("RGB"))
                 step = trainer.global_step
@@ -110,7 +116,10 @@ class CloudVisualization(Callback):
 
     @torch.no_grad()
     def _draw(
-        self, trainer: L.Trainer, module: Any, scores: Mapping[str, Tensor] | None
+        self,
+        trainer: L.Trainer,
+        module: Any,
+        scores: Mapping[str, Tensor] | None,
     ) -> "_Drawn":
         """Draw the clouds with the nets as they are.
 
@@ -162,7 +171,9 @@ class CloudVisualization(Callback):
         matrix = output.matrix
         if matrix is not None and points.shape[1] * matrix.m <= DENSE_PIXELS:
             first = matrix.first_cloud()
-            figures["matrix"] = drawing.matrix_figure(first.dense()[0], first.gram()[0], titles[0])
+            dense = first.dense()[0]
+            gram = first.gram()[0]
+            figures["matrix"] = drawing.matrix_figure(dense, gram, titles[0])
         return _Drawn(figures, points, samples, titles)
 
     def _comparison(
@@ -174,7 +185,8 @@ class CloudVisualization(Callback):
     ) -> Figure:
         """Draw one cloud with the sample of each method, under the method's test score."""
         cloud = (len(self.titles) - 1) // 2
-        info = MetricInfo.of(module.task.score, module.task.metrics()[module.task.score])
+        metrics = module.task.metrics()
+        info = MetricInfo.of(module.task.score, metrics[module.task.score])
         labels = {module.main_readout: type(module.sampler).__name__, FULL: "all points"}
         prefixes: dict[str, str] = dict.fromkeys(samples, module.prefixes[module.m])
         prefixes[FULL] = ""
@@ -183,7 +195,8 @@ class CloudVisualization(Callback):
             captions[name] = labels.get(name, name)
             score = scores.get(f"test/{prefix}{name}/{info.name}")
             if score is not None:
-                captions[name] += f": {info.format(float(score))} {info.unit}"
+                figure = info.format(float(score))
+                captions[name] += f": {figure} {info.unit}"
         drawn = {name: sample[cloud] for name, sample in samples.items()}
         return drawing.comparison(points[cloud], drawn, captions)
 
@@ -226,7 +239,9 @@ def cloud_titles(task: Task, titles: Sequence[str]) -> list[str]:
     """Return one title per cloud of a batch, from one per cloud of the data."""
     if task.clouds_per_prediction == 1:
         return list(titles)
-    return [f"{title}_{side}" for side in ("source", "target") for title in titles]
+    doubled = [f"{title}_source" for title in titles]
+    doubled += [f"{title}_target" for title in titles]
+    return doubled
 
 
 def clouds_to_draw(dataset: CloudDataset, number: int) -> tuple[Tensor, list[str]]:
@@ -241,7 +256,8 @@ def clouds_to_draw(dataset: CloudDataset, number: int) -> tuple[Tensor, list[str
     labels = dataset.test.labels
     classes = len(dataset.class_names)
     candidates = _spread(classes, max(number, 1))
-    present = [label for label in candidates.tolist() if label in labels][:number]
+    candidates_in_test = [label for label in candidates.tolist() if label in labels]
+    present = candidates_in_test[:number]
     rows: list[int] = []
     titles: list[str] = []
     for position, label in enumerate(present):
@@ -255,7 +271,8 @@ def clouds_to_draw(dataset: CloudDataset, number: int) -> tuple[Tensor, list[str
         if len(rows_of_class) == 1:
             titles.append(name)
         else:
-            titles += [f"{name} {count}" for count in range(1, len(rows_of_class) + 1)]
+            numbers = range(1, len(rows_of_class) + 1)
+            titles += [f"{name} {count}" for count in numbers]
     return torch.tensor(rows, dtype=torch.int64), titles
 
 
