@@ -77,7 +77,9 @@ def parsed(settings: dict[str, Any], place: str) -> list[Override]:
     parser = OverridesParser.create()
     overrides = []
     for key, value in settings.items():
-        text = "null" if value is None else str(value)
+        text = "null"
+        if value is not None:
+            text = str(value)
         try:
             overrides.append(parser.parse_override(f"{key}={text}"))
         except HydraException:
@@ -89,4 +91,6 @@ def parsed(settings: dict[str, Any], place: str) -> list[Override]:
 
 
 def _plain(node: Any) -> Any:
-    return OmegaConf.to_container(node, resolve=False) if OmegaConf.is_config(node) else node
+    if not OmegaConf.is_config(node):
+        return node
+    return OmegaConf.to_container(node, resolve=False)

@@ -91,7 +91,8 @@ class PointChannels:
                 f"point_channels must be a whole number from 0 to {MOST}, or PointChannels, got "
                 f"{value!r:.99}."
             )
-        return cls(Channel(f"channel_{number}") for number in range(1, int(value) + 1))
+        numbers = range(1, int(value) + 1)
+        return cls(Channel(f"channel_{number}") for number in numbers)
 
     @classmethod
     def from_plain(cls, rows: Any) -> "PointChannels":
@@ -104,9 +105,11 @@ class PointChannels:
             raise ValueError("channels must be a list")
         columns: list[Channel] = []
         for row in rows:
-            if not isinstance(row, list) or len(row) != 3 or not isinstance(row[0], str):
+            is_triple = isinstance(row, list) and len(row) == 3
+            if not is_triple or not isinstance(row[0], str):
                 raise ValueError("a channel must have a name, a mean and a scale")
-            columns.append(Channel(row[0], float(row[1]), float(row[2])))
+            name, mean, scale = row
+            columns.append(Channel(name, float(mean), float(scale)))
         return cls(columns)
 
     def to_plain(self) -> list[list[Any]]:
@@ -209,7 +212,8 @@ class PointChannels:
         if first is None:
             return result
         before, normals, after = result.tensor_split((first, first + 3), -1)
-        moved = torch.cat([before, normals @ torch.linalg.inv(matrix).mT, after], -1)
+        inverse = torch.linalg.inv(matrix)
+        moved = torch.cat([before, normals @ inverse.mT, after], -1)
         return self.renormalised(moved)
 
 

@@ -133,8 +133,9 @@ def load_npz(path: Path) -> dict[str, Any]:
             raise ValueError(f"{announced:,} bytes announced in {path.stat().st_size:,}")
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-        if other := next((n for n, a in arrays.items() if not isinstance(a, np.ndarray)), None):
-            raise ValueError(f"{other} is not an array")  # numpy returns the bytes of other members
+        for name, array in arrays.items():
+            if not isinstance(array, np.ndarray):  # numpy returns the bytes of other members
+                raise ValueError(f"{name} is not an array")
         return arrays
     except Exception as error:  # numpy parses headers as Python literals
         raise UserError(f"{path} is broken: {one_line(error)}.") from None

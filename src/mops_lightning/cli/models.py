@@ -99,8 +99,10 @@ def _table() -> list[str]:
             continue
         task = card["record"]["config"]["names"]["task"]
         licence = card["licence"].partition(";")[0]
-        rows.append((name, task, _sizes(card), _figures(card), licence, _megabytes(path)))
-    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
+        row = (name, task, _sizes(card), _figures(card), licence, _megabytes(path))
+        rows.append(row)
+    columns = zip(*rows, strict=True)
+    widths = [max(len(cell) for cell in column) for column in columns]
     lines = []
     for row in rows:
         cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
@@ -186,7 +188,8 @@ def _figures(card: dict[str, Any]) -> str:
     values = figures["values"]
     if figures["m"] is None:
         return f"{figures['metric']}: {values.get('full', 'unknown')} on all points"
-    listed = ", ".join(f"{value} {readout}" for readout, value in values.items())
+    texts = [f"{value} {readout}" for readout, value in values.items()]
+    listed = ", ".join(texts)
     return f"{figures['metric']}, m={figures['m']}: {listed}"
 
 

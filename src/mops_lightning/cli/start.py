@@ -139,7 +139,8 @@ def check_paths(cfg: DictConfig) -> None:
             reason = str(error)  # Python's own: no such user, a null byte
             if isinstance(error, OSError):
                 reason = str(error.strerror)
-            raise UserError(f"{name}: {value[:100]}: {reason.rstrip('.')}.") from None
+            reason = reason.rstrip(".")
+            raise UserError(f"{name}: {value[:100]}: {reason}.") from None
 
 
 def _check_missing(name: str, value: str) -> None:

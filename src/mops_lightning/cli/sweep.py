@@ -199,4 +199,5 @@ def _move_aside(folder: Path) -> None:
     for name in sorted(names, key=_order_of_moving):
         (folder / name).rename(moving / name)
     numbers = [_attempt_number(path) for path in _attempts(folder)]
-    moving.rename(folder / ASIDE / str(max(numbers, default=0) + 1))
+    number = max(numbers, default=0) + 1
+    moving.rename(folder / ASIDE / str(number))

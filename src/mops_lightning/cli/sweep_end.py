@@ -107,7 +107,8 @@ class SweepSummary(Callback):
             if path.stat().st_mtime_ns >= begun:
                 states[cell] = _state(cell)
         numbers = sorted(Counter(states.values()).items())
-        counts = ", ".join(f"{count} {state}" for state, count in numbers) or "no values to sweep"
+        texts = [f"{count} {state}" for state, count in numbers]
+        counts = ", ".join(texts) or "no values to sweep"
         print(f"{len(states)} cells: {counts}; in {folder}")
         return states
 
@@ -117,8 +118,10 @@ class SweepSummary(Callback):
 
         completed = [cell for cell, state in states.items() if state == "completed"]
         if completed:
-            options = ["--mixed"] if self.mixed else []
-            report.main([str(folder), *options], "python -m mops_lightning report")
+            arguments = [str(folder)]
+            if self.mixed:
+                arguments.append("--mixed")
+            report.main(arguments, "python -m mops_lightning report")
         if self.models:
             _add_models(completed, folder)
 

@@ -99,7 +99,9 @@ class Reading:
             check_at_least(1, crops=crops)
         if crop == "surface":
             _check_surface(crops, label=label, columns=columns, features=features)
-        named = None if columns is None else tuple(check_columns("columns", columns))
+        named = None
+        if columns is not None:
+            named = tuple(check_columns("columns", columns))
         return cls(n_points, crop, crops, seed, label, named, check_features(features))
 
 
@@ -108,9 +110,11 @@ def _check_surface(crops: int | None, **of_files: Any) -> None:
     if crops != 1:
         raise UserError(f"crops must be 1 with crop=surface, got {crops}.")
     for name, value in of_files.items():
-        if value is not None:
-            value = value if isinstance(value, str) else list(value)
-            raise UserError(f"{name} must be null with crop=surface, got {value!r}.")
+        if value is None:
+            continue
+        if not isinstance(value, str):
+            value = list(value)
+        raise UserError(f"{name} must be null with crop=surface, got {value!r}.")
 
 
 def read_clouds(folder: Path, files: Sequence[SourceFile], reading: Reading) -> list[Content]:
@@ -119,7 +123,8 @@ def read_clouds(folder: Path, files: Sequence[SourceFile], reading: Reading) -> 
     surface = max(10_000, 8 * (reading.n_points or 0))
     for file in with_progress(files):
         path = folder / file.name
-        rng = np.random.default_rng(derive_seed(reading.seed, zlib.crc32(str(file.name).encode())))
+        number_of_file = zlib.crc32(str(file.name).encode())
+        rng = np.random.default_rng(derive_seed(reading.seed, number_of_file))
         table = read(path, surface, reading.seed, columns=reading.columns).finite()
         drawn = random_crops(table.points, reading.n_points, reading.crops, reading.crop, rng, path)
         numbers = None

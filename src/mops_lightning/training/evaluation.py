@@ -161,7 +161,9 @@ def command_line(arguments: list[str]) -> list[str]:
     if name is None:
         return arguments
     path = Path(name).expanduser()
-    trained = TrainedRun.read(str(path) if path.exists() else name)
+    if path.exists():
+        name = str(path)
+    trained = TrainedRun.read(name)
     of_run = _settings_of_run(trained)
     # A process that is started by another one of its run is given the settings of the run, too.
     not_of_user = [*namings, *of_run]
@@ -178,7 +180,9 @@ def command_line(arguments: list[str]) -> list[str]:
 
 def _settings_of_run(trained: TrainedRun) -> list[str]:
     """Return the overrides that make a command line an evaluation of a run."""
-    learn = "task" if trained.trained_task_net else "nothing"
+    learn = "nothing"
+    if trained.trained_task_net:
+        learn = "task"
     return [
         *trained.choices(),
         f"learn={learn}",

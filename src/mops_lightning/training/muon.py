@@ -78,7 +78,8 @@ class MuonAdam(Optimizer):
             state["momentum_buffer"] = torch.zeros_like(gradient)
         mean = state["momentum_buffer"].lerp_(gradient, 1 - momentum)
         direction = orthogonalised(gradient.lerp(mean, momentum))
-        matrix.sub_(direction, alpha=lr * RMS * math.sqrt(max(matrix.shape)))
+        step = lr * RMS * math.sqrt(max(matrix.shape))
+        matrix.sub_(direction, alpha=step)
 
 
 def orthogonalised(matrix: Tensor) -> Tensor:
@@ -92,7 +93,9 @@ def orthogonalised(matrix: Tensor) -> Tensor:
     """
     rows, columns = matrix.shape
     is_tall = rows > columns
-    x = matrix.T if is_tall else matrix
+    x = matrix
+    if is_tall:
+        x = matrix.T
     if matrix.is_cuda:
         x = x.to(torch.bfloat16)
     x = x / x.norm().clamp_min(1e-7)

@@ -50,7 +50,10 @@ def read_task(reference: str) -> TrainedTask:
     """
     trained = _trained_run(reference)
     is_task_net = trained.trained_task_net or _is_task_net(trained.path)
-    path = weights.of_run(trained.path) if is_task_net else _task_weights(trained)
+    if is_task_net:
+        path = weights.of_run(trained.path)
+    else:
+        path = _task_weights(trained)
     content = weights.read(path)
     record = trained.record
     outputs = {

@@ -42,7 +42,9 @@ def to_distance(
         raise UserError("space is for fps, poisson and spacing; voxels are cubes of coordinates.")
     if is_generated and weight is not None:
         raise UserError("weight: the means of voxels take no weights.")
-    sample_voxels = _voxel_means if is_generated else _voxels
+    sample_voxels = _voxels
+    if is_generated:
+        sample_voxels = _voxel_means
     samples = [sample_voxels(cloud, size) for cloud in clouds.clouds]
     return clouds.join(samples, same_size=False)
 

@@ -107,7 +107,8 @@ class Choice:
         heavy = np.flatnonzero(weight)
         check_positive(len(heavy), number)
         weights = torch.from_numpy(weight[heavy])[None]
-        chosen = choose(points[:, heavy], number, seed, weight=weights, in_sphere=True)[0]
+        heavy_points = points[:, heavy]
+        chosen = choose(heavy_points, number, seed, weight=weights, in_sphere=True)[0]
         return cloud.rows(heavy[chosen.numpy()])
 
 

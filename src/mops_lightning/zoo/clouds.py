@@ -197,12 +197,14 @@ class Clouds:
 
 
 def _check_shape(points: Tensor, batch: Any) -> None:
-    dimensions = (2, 3) if batch is None else (2,)
-    wanted = "(N, 3) or (B, N, 3)" if batch is None else "(P, 3) with batch"
+    dimensions: tuple[int, ...] = (2, 3)
+    wanted = "(N, 3) or (B, N, 3)"
+    if batch is not None:
+        dimensions = (2,)
+        wanted = "(P, 3) with batch"
     if points.ndim not in dimensions or points.shape[-1] < 3:
-        raise UserError(
-            f"points must have shape {wanted}, or more columns, got {tuple(points.shape)}."
-        )
+        shape = tuple(points.shape)
+        raise UserError(f"points must have shape {wanted}, or more columns, got {shape}.")
 
 
 def _pair(points: Sequence[Tensor], weight: Any) -> list[Cloud]:

@@ -50,7 +50,9 @@ class GeneratedPoints(nn.Module):
 
     def __init__(self, sampler: Sampler, m: int | None = None) -> None:
         super().__init__()
-        self.m = sampler.m if m is None else m
+        if m is None:
+            m = sampler.m
+        self.m = m
         sampler.check_m(self.m)
         if not isinstance(sampler, MOPSNet | SNet):
             raise UserError(
@@ -168,7 +170,8 @@ def _clouds(m: int, least: int, channels: PointChannels) -> Iterable[Tensor]:
     shapes = [(clouds, times * least + 5) for clouds, times in CHECKED]
     for clouds, number in [*shapes, (1, many)]:
         points = torch.randn(clouds, number, 3, generator=rng)
-        points = points / points.norm(dim=2).amax(1)[:, None, None]
+        radii = points.norm(dim=2).amax(1)
+        points = points / radii[:, None, None]
         if channels:
             values = torch.randn(clouds, number, len(channels), generator=rng)
             points = torch.cat([points, values], 2)

@@ -208,8 +208,10 @@ def _members(node: dict[str, Any], path: Path) -> list[Sampler]:
         UserError: one of them is not a sampler of this package.
     """
     members = node.get("samplers")
+    if not isinstance(members, list):
+        members = []
     samplers = []
-    for member in members if isinstance(members, list) else []:
+    for member in members:
         cls = _known_class(member, package_samplers())
         if cls is None:
             raise UserError(

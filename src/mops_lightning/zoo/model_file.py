@@ -99,7 +99,9 @@ class Damaged(UserError):
 
 def damaged(path: str | Path, reason: str = "") -> Damaged:
     """Return the error for a file that is damaged or of another kind."""
-    because = f" ({reason})" if reason else ""
+    because = ""
+    if reason:
+        because = f" ({reason})"
     return Damaged(
         f"{path} is damaged or not a file of this program{because}. Make it again, or give another."
     )
@@ -179,6 +181,8 @@ def digest(state: "dict[str, Tensor]") -> str:
     total = hashlib.sha256()
     for name in sorted(state):
         value = state[name].detach().cpu().contiguous()
-        total.update(f"{name} {tuple(value.shape)} {value.dtype}".encode())
-        total.update(value.view(-1).view(torch.uint8).numpy().tobytes())
+        described = f"{name} {tuple(value.shape)} {value.dtype}"
+        total.update(described.encode())
+        as_bytes = value.view(-1).view(torch.uint8)
+        total.update(as_bytes.numpy().tobytes())
     return total.hexdigest()

@@ -20,16 +20,20 @@ def check_names(names: list[str] | None, task: Task, dataset: CloudDataset, what
     if task.output_names is None:
         return
     own = list(getattr(dataset, task.output_names))
-    kind = "classes" if task.output_names == "class_names" else "parts"
+    kind = "parts"
+    if task.output_names == "class_names":
+        kind = "classes"
     if names is None:
         raise UserError(
             f"{what} does not name the {kind} of its net, so it can be used with its own data only."
         )
     if list(names) != own:
         missing = [name for name in names if name not in own] or list(names)
+        of_net = ", ".join(missing[:3])
+        of_data = ", ".join(own[:3])
         raise UserError(
             f"{what}: its net has {len(names)} {kind}, which are not the {len(own)} {kind} "
-            f"of the data: {', '.join(missing[:3])} ... instead of {', '.join(own[:3])} .... "
+            f"of the data: {of_net} ... instead of {of_data} .... "
             f"Give a task net of these {kind} with weights=auto, or data of its {kind} with "
             "dataset.classes or dataset.label."
         )

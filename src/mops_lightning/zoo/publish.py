@@ -55,10 +55,9 @@ def add(
     record = _whole_record(run)
     content = weights.read(weights.of_run(run))
     state = content["state"]
-    wide = _wide_names(state) if half else []
-    for wide_name in wide:
-        state[wide_name] = state[wide_name].half()
-    if wide:
+    precision = "float32"
+    if half and _rounds_wide(state):
+        precision = "float16"
         notes = f"{notes} {ROUNDED}".lstrip()
     files = {"weights": name}
     if record.config["learn"] == "sampler":
@@ -70,7 +69,7 @@ def add(
         "name": name,
         "transform": "unit_sphere",
         "licence": licence,
-        "precision": "float16" if wide else "float32",
+        "precision": precision,
         "notes": notes,
         "classes": content["classes"],
         "figures": card_figures(record),
@@ -120,13 +119,15 @@ def _has_weights(record: RunRecord) -> bool:
     return record.status == "completed" and "weights" in record.files
 
 
-def _wide_names(state: dict[str, Tensor]) -> list[str]:
-    """Return the names of the weight matrices that may be stored in 16 bits."""
+def _rounds_wide(state: dict[str, Tensor]) -> bool:
+    """Round the wide weight matrices to 16 bits; whether there are any."""
     wide = []
     for name, value in state.items():
         if value.ndim == 2 and value.numel() >= WIDE:
             wide.append(name)
-    return wide
+    for name in wide:
+        state[name] = state[name].half()
+    return bool(wide)
 
 
 def add_all(runs: Iterable[Path], sweep: Path, folder: Path) -> list[Path]:
@@ -151,8 +152,10 @@ def add_all(runs: Iterable[Path], sweep: Path, folder: Path) -> list[Path]:
             continue
         parts = (sweep.name, str(run.relative_to(sweep)))
         name = ".".join(re.sub(r"[^a-z0-9_-]+", "-", part.lower()) for part in parts)
-        trained = task_nets if record.config["learn"] == "task" else samplers
-        trained.append((name, run))
+        if record.config["learn"] == "task":
+            task_nets.append((name, run))
+        else:
+            samplers.append((name, run))
     in_order = [*sorted(task_nets), *sorted(samplers)]
     return [add(run, name, folder, overwrite=True) for name, run in in_order]
 

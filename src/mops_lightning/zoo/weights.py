@@ -120,11 +120,14 @@ def of_run(run: Path, kind: str = "weights") -> Path:
         files = model_file.read_card(run)["record"]["files"]
         run = run.parent
     else:
-        has_record = (run / run_record.FILE).is_file()
-        files = run_record.read(run).files if has_record else {}
+        files = {}
+        if (run / run_record.FILE).is_file():
+            files = run_record.read(run).files
     named = files.get(kind, f"{kind}{model_file.SUFFIX}")
     path = run / named
-    return path if path.exists() else names.find_model(named) or path
+    if path.exists():
+        return path
+    return names.find_model(named) or path
 
 
 def of_task_net(reference: str | Path) -> Path:
@@ -141,7 +144,9 @@ def of_task_net(reference: str | Path) -> Path:
     if not path.is_dir():
         return path
     joint = of_run(path, "task_weights")
-    return joint if joint.is_file() else of_run(path)
+    if joint.is_file():
+        return joint
+    return of_run(path)
 
 
 def load_into(module: nn.Module, path: str | Path) -> dict[str, Any]:
@@ -188,15 +193,18 @@ def fit_state(
 def first_nonfinite(state: Any, name: str = "") -> str | None:
     """Return the dotted name of the first tensor with NaN or infinity in nested data, if any."""
     if isinstance(state, Tensor):
-        is_finite = bool(torch.isfinite(state).all())
-        return None if is_finite else name
+        if bool(torch.isfinite(state).all()):
+            return None
+        return name
     parts: Iterable[tuple[Any, Any]] = ()
     if isinstance(state, Mapping):
         parts = state.items()
     elif isinstance(state, list | tuple):
         parts = enumerate(state)
     for key, value in parts:
-        path = f"{name}.{key}" if name else str(key)
+        path = str(key)
+        if name:
+            path = f"{name}.{key}"
         nonfinite = first_nonfinite(value, path)
         if nonfinite:
             return nonfinite

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mops_lightning.data.formats.columns import common_names
 from mops_lightning.data.formats.guard import BadCloudError
 from mops_lightning.data.formats.isolated import isolated
 from mops_lightning.data.formats.table import Column, Form, Table
@@ -55,14 +56,18 @@ def _parse(path: Path) -> Table:
     scans = [scan for scan in scans if len(scan.points)]
     if not scans:
         raise BadCloudError(f"{path} holds no points.")
-    names = [name for name in scans[0].columns if all(name in scan.columns for scan in scans)]
+    names = common_names([scan.columns for scan in scans])
     columns = {name: np.concatenate([scan.columns[name] for scan in scans]) for name in names}
-    left_out = {name for scan in scans for name in (*scan.columns, *scan.form.left_out)}
+    left_out: set[str] = set()
+    for scan in scans:
+        left_out.update(scan.columns, scan.form.left_out)
     if len(scans) > 1:
         lengths = [len(scan.points) for scan in scans]
-        columns["scan"] = np.repeat(np.arange(len(scans), dtype=np.uint16), lengths)
+        numbers = np.arange(len(scans), dtype=np.uint16)
+        columns["scan"] = np.repeat(numbers, lengths)
     points = np.concatenate([scan.points for scan in scans])
-    form = Form(np.dtype(np.float64), left_out=tuple(sorted(left_out.difference(columns))))
+    lost = sorted(left_out.difference(columns))
+    form = Form(np.dtype(np.float64), left_out=tuple(lost))
     return Table(points, columns, form=form)
 
 
@@ -116,9 +121,10 @@ def _cartesian(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return x, y and z of ranges, azimuths and elevations, angles in radians."""
     distance, azimuth, elevation = points.T
     flat = distance * np.cos(elevation)
-    return np.stack(
-        [flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(elevation)], 1
-    )
+    x = flat * np.cos(azimuth)
+    y = flat * np.sin(azimuth)
+    z = distance * np.sin(elevation)
+    return np.stack([x, y, z], 1)
 
 
 def _narrow(name: str, values: NDArray[np.float64]) -> Column:

@@ -73,7 +73,9 @@ def ends_early(path: Path, number: int) -> BadCloudError:
 def check_size(path: Path, number: int, m: int, area: object = None) -> None:
     """Reject a cloud, or an area of it, of fewer points than are to be kept."""
     if number < m:
-        where = "" if area is None else " in the chosen area"
+        where = ""
+        if area is not None:
+            where = " in the chosen area"
         raise BadCloudError(f"{path} holds {number} points{where}, fewer than --m {m}.")
 
 

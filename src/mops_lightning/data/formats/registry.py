@@ -117,12 +117,17 @@ def read_points(path: Path, columns: Sequence[str] | None = None) -> Table | Non
     suffix = path.suffix.lower()
     if suffix == ".bin":
         return scans.read(path, columns)
-    return READERS[suffix](path) if suffix in READERS else None
+    if suffix not in READERS:
+        return None
+    return READERS[suffix](path)
 
 
 def suffix_of(path: Path) -> str:
     """Return the end of a name that says which format a written file has."""
-    return ".copc.laz" if path.name.lower().endswith(".copc.laz") else path.suffix.lower()
+    name = path.name.lower()
+    if name.endswith(".copc.laz"):
+        return ".copc.laz"
+    return path.suffix.lower()
 
 
 def write(path: Path, table: Table | TableParts) -> None:

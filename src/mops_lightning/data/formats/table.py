@@ -81,7 +81,9 @@ class Table:
     def finite(self) -> "Table":
         """Return the points whose coordinates are all finite."""
         finite = np.isfinite(self.points).all(axis=1)
-        return self if finite.all() else self.take(np.flatnonzero(finite))
+        if finite.all():
+            return self
+        return self.take(np.flatnonzero(finite))
 
     def whole_numbers(self, name: str, path: Path) -> NDArray[np.int64]:
         """Return a column of whole numbers ``(N,)``, such as the classes of points.
@@ -110,7 +112,9 @@ class Table:
         with np.errstate(all="ignore"):
             stored = self.points.astype(kind.newbyteorder("="))
         same = np.array_equal(stored, self.points, equal_nan=stored.dtype.kind == "f")
-        return stored if same else self.points
+        if same:
+            return stored
+        return self.points
 
 
 def join_tables(tables: Iterable[Table]) -> Table:

@@ -50,7 +50,9 @@ def read(path: Path) -> Table:
         raise BadCloudError(f"{path} is empty.")
     separator = _separator(lines[-1])
     announced = None
-    if len(lines) > 1 and len(lines[0].split(separator)) == 1 and lines[0].isdecimal():
+    first_words = lines[0].split(separator)
+    is_count = len(first_words) == 1 and lines[0].isdecimal()
+    if is_count and len(lines) > 1:
         announced = int(lines.pop(0))
     words = _words(lines[0], separator)
     if any(map(_is_number, words)):
@@ -67,7 +69,9 @@ def read(path: Path) -> Table:
         raise BadCloudError(f"{path} must hold rows of x, y, z, got {len(columns)} columns.")
     header, names = _header(text, separator, words, len(columns))
     table = from_columns(dict(zip(names, columns, strict=True)), path)
-    blank = "\t" if "\t" in lines[-1] else " "
+    blank = " "
+    if "\t" in lines[-1]:
+        blank = "\t"
     layout = TextForm(
         separator=separator or blank,
         header=header,
@@ -97,7 +101,9 @@ def _separator(line: str) -> str | None:
 
 
 def _name_in_table(name: str, table: Table) -> str:
-    return name if name in table.columns else name.lower()
+    if name in table.columns:
+        return name
+    return name.lower()
 
 
 def _words(line: str, separator: str | None) -> list[str]:
@@ -147,10 +153,12 @@ def numbers_of_lines(lines: list[str], separator: str | None) -> list[Column]:
     array: NDArray[Any] = np.loadtxt(lines, delimiter=separator, ndmin=2)
     columns: list[Column] = []
     for number, values in enumerate(array.T):
-        integers = None
+        column: Column = values
         if np.isfinite(values).all() and (values == np.rint(values)).all():
             integers = _integers(lines, separator, number)
-        columns.append(values if integers is None else integers)
+            if integers is not None:
+                column = integers
+        columns.append(column)
     return columns
 
 
@@ -209,9 +217,13 @@ def _order(names: list[str], form: TextForm) -> list[int]:
     return order
 
 
+def _is_of_unnamed(name: str) -> bool:
+    return name in ("x", "y", "z") or name.startswith("column_")
+
+
 def _new_header(form: TextForm, names: list[str]) -> str:
     """Return a line of names; none if all names are those of unnamed columns."""
-    are_unnamed = all(name in ("x", "y", "z") or name.startswith("column_") for name in names)
+    are_unnamed = all(_is_of_unnamed(name) for name in names)
     if are_unnamed and not form.header:
         return ""
     line = form.separator.join(names)

@@ -50,7 +50,9 @@ def build_parts(
     experiment = make_experiment(cfg, dataset, identity)
     trainer = make_trainer(cfg, folder, dataset, experiment, len(train.labels))
     parts = Parts(cfg, folder, dataset, train, held_out, experiment, trainer, resumed, trained)
-    validated = len(held_out.labels) if parts.trains else 0
+    validated = 0
+    if parts.trains:
+        validated = len(held_out.labels)
     tested = len(dataset.test.labels)
     check_processes(dataset, trainer.world_size)
     distributed.check_shares(cfg.batch_size, tested, validated, trainer.world_size)

@@ -71,7 +71,9 @@ def _given_nets(cfg: DictConfig, trained: TrainedRun | None) -> Iterator[GivenNe
         yield GivenNet("pretrain_from", cfg.pretrain_from, weights.of_task_net)
     for name in cfg.other_nets or ():
         yield GivenNet("other_nets", name, weights.of_task_net)
-    start = cfg.recipe.get("warm_start") if cfg.recipe else None
+    start = None
+    if cfg.recipe:
+        start = cfg.recipe.get("warm_start")
     if isinstance(start, str):
         yield GivenNet("recipe.warm_start", start, _of_sampler)
 

@@ -98,6 +98,7 @@ def has_weights(module: nn.Module) -> bool:
 
 def augmentation(cfg: DictConfig) -> Augmentation:
     """Return the augmentation of this run; joint training has the sampler's."""
-    learns_task_alone = cfg.learn == "task"
-    settings = cfg.augment.task if learns_task_alone else cfg.augment.sampler
+    settings = cfg.augment.sampler
+    if cfg.learn == "task":
+        settings = cfg.augment.task
     return Augmentation(**(settings or {}))

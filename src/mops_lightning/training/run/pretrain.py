@@ -72,7 +72,9 @@ def task_weights(cfg: DictConfig, dataset: CloudDataset, run_folder: Path) -> Pa
 
 def _train(cfg: DictConfig, folder: Path, dataset: CloudDataset) -> None:
     """Train the task net of a run in a folder, or resume its interrupted training there."""
-    epochs = "1 epoch" if cfg.epochs.task == 1 else f"{cfg.epochs.task} epochs"
+    epochs = f"{cfg.epochs.task} epochs"
+    if cfg.epochs.task == 1:
+        epochs = "1 epoch"
     print(
         f"No cached weights of {cfg.names.net} for {cfg.names.dataset}: training it "
         f"first, {epochs}. Cache: {folder}",
@@ -84,7 +86,9 @@ def _train(cfg: DictConfig, folder: Path, dataset: CloudDataset) -> None:
         task_cfg.ckpt_path = str(folder)
     try:
         with recorded(_plain(task_cfg), folder, []) as record:
-            start = None if is_resumed else _start_weights(cfg.pretrain_from)
+            start = None
+            if not is_resumed:
+                start = _start_weights(cfg.pretrain_from)
             parts = build_parts(task_cfg, folder, dataset, record)
             train_and_test(parts, record, start)
     except (KeyboardInterrupt, Interrupted):
@@ -134,8 +138,10 @@ def cache_folder(cfg: DictConfig, dataset: CloudDataset) -> Path:
     for name in SHORTENS:  # the cached net is that of a whole training
         settings["trainer"].pop(name, None)
     key = checkpoint_identity(settings, dataset.fingerprint)
-    digest = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:12]
-    name = f"{cfg.names.task}-{cfg.names.net}-{cfg.names.dataset}-{digest}"
+    text = json.dumps(key, sort_keys=True)
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    names = cfg.names
+    name = f"{names.task}-{names.net}-{names.dataset}-{digest[:12]}"
     return Path(cfg.cache).expanduser() / "weights" / name
 
 

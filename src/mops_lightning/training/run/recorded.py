@@ -37,8 +37,10 @@ def recorded(
         record.error = str(stop) or "interrupted"
         raise
     except BaseException as error:
+        record.status = "failed"
         has_no_reader = isinstance(error, BrokenPipeError) and closed_outputs()
-        record.status = "interrupted" if has_no_reader else "failed"
+        if has_no_reader:
+            record.status = "interrupted"
         record.error = f"{type(error).__name__}: {error}"
         raise
     finally:

@@ -130,7 +130,9 @@ class Header:
     def number(self) -> int:
         """Number of points."""
         old = self._number("<I", 107)
-        return (self._number("<Q", 247) or old) if self.minor >= 4 else old
+        if self.minor < 4:
+            return old
+        return self._number("<Q", 247) or old
 
     @property
     def scales(self) -> tuple[float, ...]:
@@ -213,7 +215,8 @@ def read_header(path: Path) -> Header:
             raise BadCloudError(
                 f"{path} is LAS {major}.{minor}, but versions 1.0 to 1.5 are read. Convert it."
             )
-        head += file.read(max(struct.unpack_from("<H", head, 94)[0] - len(head), 0))
+        (announced,) = struct.unpack_from("<H", head, 94)
+        head += file.read(max(announced - len(head), 0))
         if len(head) < HEADER_BYTES[minor]:
             raise BadCloudError(f"{path} is broken: its header has {len(head)} bytes.")
         header = Header(head)
@@ -256,7 +259,9 @@ def _read_records(file: BinaryIO, header: Header, size: int) -> tuple[Record, ..
         reserved, user, identifier, length, description = RECORD.unpack(file.read(RECORD.size))
         data = file.read(length)
         records.append(Record(reserved, user, identifier, description, data))
-    if file.tell() > min(header.first, size) or (records and len(records[-1].data) < length):
+    reach_into_points = file.tell() > min(header.first, size)
+    is_cut = bool(records) and len(records[-1].data) < length
+    if reach_into_points or is_cut:
         raise ValueError("its records reach into its points")
     return tuple(records)
 
@@ -265,7 +270,10 @@ def _read_extended(file: BinaryIO, header: Header, size: int) -> tuple[tuple[Rec
     """Return the records after the points, and whether waveforms are among them."""
     place, number = _extended_place(header)
     # In version 1.3 the waveforms are the only such record.
-    inside = header.minor == 3 and struct.unpack_from("<Q", header.head, 227)[0] > 0
+    inside = False
+    if header.minor == 3:
+        (place_of_waveforms,) = struct.unpack_from("<Q", header.head, 227)
+        inside = place_of_waveforms > 0
     records = []
     for _ in range(number):
         file.seek(place)

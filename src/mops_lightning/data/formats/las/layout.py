@@ -74,7 +74,8 @@ class Extra:
         type_ = 0
         options = self.count
         if self.documented:
-            type_ = 1 + TYPES.index(self.kind.lstrip("<|")) + len(TYPES) * (self.count - 1)
+            kind = TYPES.index(self.kind.lstrip("<|"))
+            type_ = 1 + kind + len(TYPES) * (self.count - 1)
             options = 0
         scales_and_offsets = (0.0,) * 6
         return EXTRA.pack(type_, options, self.name.encode(), *scales_and_offsets, b"")
@@ -115,11 +116,15 @@ class Dimension:
 
     @property
     def _step(self) -> float:
-        return 1.0 if self.scale is None else self.scale
+        if self.scale is None:
+            return 1.0
+        return self.scale
 
     @property
     def _start(self) -> float:
-        return 0.0 if self.offset is None else self.offset
+        if self.offset is None:
+            return 0.0
+        return self.offset
 
     def get(self, rows: Rows) -> NDArray[Any]:
         """Return the values ``(N,)``."""
@@ -139,8 +144,9 @@ class Dimension:
             numbers[:] = others | bits
         elif self.is_scaled:
             steps = (values - self._start) / self._step
-            is_whole = numbers.dtype.kind in "iu"
-            numbers[:] = np.rint(steps) if is_whole else steps
+            if numbers.dtype.kind in "iu":
+                steps = np.rint(steps)
+            numbers[:] = steps
         else:
             numbers[:] = values
 
@@ -168,9 +174,13 @@ class Layout:
     @cached_property
     def dtype(self) -> np.dtype[Any]:
         """The data type of a point."""
-        kinds: list[Any] = [(name, self.standard[name]) for name in self.standard.names or ()]
+        kinds: list[Any] = []
+        for name in self.standard.names or ():
+            kinds.append((name, self.standard[name]))
         for number, extra in enumerate(self.extra):
-            shape = () if extra.count == 1 else (extra.count,)
+            shape: tuple[int, ...] = ()
+            if extra.count > 1:
+                shape = (extra.count,)
             kinds.append((f"extra {number}", extra.kind, shape))
         return np.dtype(kinds)
 
@@ -305,7 +315,9 @@ def _kind(values: NDArray[Any]) -> str:
     if kind.kind == "b":
         return "u1"
     if kind.kind == "f" and kind.itemsize not in (4, 8):
-        return "<f4" if kind.itemsize == 2 else "<f8"
+        if kind.itemsize == 2:
+            return "<f4"
+        return "<f8"
     return kind.str.replace("|", "")
 
 
@@ -344,7 +356,9 @@ def documented_extra(header: Header) -> list[Extra]:
     for record in header.records:
         if is_extra(record):
             extra += _documented(record.data)
-    return extra if _size(extra) <= room else []
+    if _size(extra) > room:
+        return []
+    return extra
 
 
 def _documented(data: bytes) -> Iterator[Extra]:

@@ -116,8 +116,9 @@ def _copy_packed(packed: LasColumns, rows: Rows, layout: Layout) -> None:
     # Added dimensions come last, so that the old bytes of a point are the first ones of the new.
     size = packed.layout.dtype.itemsize
     old = np.ascontiguousarray(packed.rows).view(np.uint8)
-    new = rows.view(np.uint8)
-    new.reshape(len(rows), -1)[:, :size] = old.reshape(len(rows), -1)
+    old_bytes = old.reshape(len(rows), -1)
+    new_bytes = rows.view(np.uint8).reshape(len(rows), -1)
+    new_bytes[:, :size] = old_bytes
 
 
 def _modernise(packed: LasColumns, rows: Rows, layout: Layout) -> None:

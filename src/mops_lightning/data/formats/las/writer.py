@@ -174,7 +174,9 @@ def finish(
     head = _head(header, compressed)
     summary.fill(head)
     if header.minor >= 4:
-        first_extended = end if extended else 0
+        first_extended = 0
+        if extended:
+            first_extended = end
         struct.pack_into("<QI", head, 235, first_extended, len(extended))
     stream.seek(0)
     stream.write(head)
@@ -186,7 +188,8 @@ def _head(header: Header, compressed: bool) -> bytearray:
     """Return the bytes of a header with the place of the points and the kind of file."""
     head = bytearray(header.head)
     head[58:90] = SOFTWARE.ljust(32, b"\0")
-    first = len(head) + sum(len(record.to_bytes()) for record in header.records)
+    size_of_records = sum(len(record.to_bytes()) for record in header.records)
+    first = len(head) + size_of_records
     struct.pack_into("<2I", head, 96, first, len(header.records))
     head[104] &= 0x7F
     if compressed:
