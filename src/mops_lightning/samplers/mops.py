@@ -18,6 +18,7 @@ from mops_lightning.samplers.anchors import FPSAnchors
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.fused import FusedMOPSNet, fused_layer, fused_layers
 from mops_lightning.samplers.local import LocalAnchors
+from mops_lightning.samplers.own_frame import in_own_frame
 from mops_lightning.types import SampleOutput
 
 DEFAULT_WIDTH = 0.5
@@ -51,6 +52,9 @@ class MOPSNet(Sampler):
             Only with anchors.
         neighbours: k, every column chooses among its k nearest candidates; None, as in the paper,
             for all. Only with anchors.
+        own_frame: True computes features from coordinates in a frame that turns with the cloud (see
+            ``own_frame``), so that S is the same for a cloud and its turned copy; False, as in the
+            paper, from the coordinates as they are. Only with anchors.
         overlap: weight of the penalty on columns of S that choose the same points
             (``losses.subset``); 0, as in the paper, for none.
         point_channels: channels of the points, or their number. Generated points have SᵀF, with
@@ -85,6 +89,7 @@ class MOPSNet(Sampler):
         overlap: float = 0.0,
         candidates: int | None = None,
         neighbours: int | None = None,
+        own_frame: bool = False,
         point_channels: PointChannels | int = 0,
     ) -> None:
         super().__init__(m)
@@ -98,6 +103,8 @@ class MOPSNet(Sampler):
             raise UserError(f"anchors must be fps or null, got {anchors!r}.")
         check_width(anchors, anchor_width)
         check_local(anchors, candidates=candidates, neighbours=neighbours)
+        if own_frame and anchors is None:
+            raise UserError("own_frame=True needs anchors=fps, which turn with the cloud, too.")
         if not 0 <= threshold < 1:
             raise UserError(f"threshold must be at least 0 and below 1, got {threshold}.")
         self.alpha = alpha
@@ -105,6 +112,7 @@ class MOPSNet(Sampler):
         self.threshold = threshold
         self.tau_min = tau_min
         self.training_tau = 1.0
+        self.own_frame = own_frame
         self.streams = anchors is None  # farthest points need all points at once
         self.is_thinned = candidates is not None
         local = feature_channels[-1]
@@ -144,15 +152,18 @@ class MOPSNet(Sampler):
         if m is None:
             m = self.m
         places = coordinates(points)
+        described = points
+        if self.own_frame:
+            described = in_own_frame(points, self.point_channels)
         if isinstance(self.queries, LocalAnchors):
 
             def keys_of(candidates: Tensor, rows: Tensor) -> Tensor:
-                if not self.point_channels:
+                if not self.point_channels and not self.own_frame:
                     return self._keys(candidates)
-                return self._keys(gather_points(points, rows))
+                return self._keys(gather_points(described, rows))
 
             return self.queries.local_matrix(places, keys_of, m, self.tau)
-        keys = self._keys(points)
+        keys = self._keys(described)
         if isinstance(self.queries, FPSAnchors):
             return self.queries(places, keys, m, self.tau)
         return SamplingMatrix(self.queries.weight, keys, self.tau).leftmost(m)

@@ -1,0 +1,103 @@
+"""Features in a frame that turns with the cloud: samples turn with it, too."""
+
+import pytest
+import torch
+
+from mops_lightning import FMOPSNet, MOPSNet
+from mops_lightning.channels import NO_CHANNELS, Channel, PointChannels
+from mops_lightning.errors import UserError
+from mops_lightning.ops.rigid import quaternion_from_euler, quaternion_to_matrix
+from mops_lightning.samplers.own_frame import in_own_frame, own_axes
+
+LAYERS = {"feature_channels": (8, 6), "rho_channels": (12, 10)}
+
+
+def moved_sampler(own_frame, **settings):
+    """A sampler with anchors whose columns depend on its features."""
+    torch.manual_seed(0)
+    sampler = FMOPSNet(6, anchors="fps", own_frame=own_frame, tau_min=1.0, **LAYERS, **settings)
+    for weights in sampler.queries.parameters():
+        torch.nn.init.normal_(weights, std=1.0)
+    return sampler.double().eval()
+
+
+def turned_pair(rng):
+    """Three clouds, and each under a rotation and a translation of its own."""
+    clouds = torch.randn(3, 70, 3, dtype=torch.float64, generator=rng)
+    angles = torch.rand(3, 3, dtype=torch.float64, generator=rng) * 3
+    rotations = quaternion_to_matrix(quaternion_from_euler(angles))
+    shift = torch.randn(3, 1, 3, dtype=torch.float64, generator=rng)
+    return clouds, clouds @ rotations.mT + shift, rotations, shift
+
+
+@pytest.mark.parametrize(
+    "columns", [{}, {"candidates": 3, "neighbours": 5}, {"neighbours": 5}, {"candidates": 3}]
+)
+def test_sample_of_a_turned_cloud_is_the_turned_sample(columns, rng):
+    clouds, turned, rotations, shift = turned_pair(rng)
+    sampler = moved_sampler(True, **columns)
+
+    sample = sampler(clouds).points
+    sample_of_turned = sampler(turned).points
+
+    torch.testing.assert_close(sample_of_turned, sample @ rotations.mT + shift)
+
+
+def test_sample_without_own_frame_does_not_turn_with_its_cloud(rng):
+    clouds, turned, rotations, shift = turned_pair(rng)
+    sampler = moved_sampler(False)
+
+    apart = sampler(turned).points - (sampler(clouds).points @ rotations.mT + shift)
+
+    assert apart.norm(dim=2).mean() > 0.001
+
+
+def test_own_axes_of_known_farthest_points():
+    # The mean is at the origin. Farthest: 4 along x; then −3 along x; then ±2 along z.
+    x = [[4.0, 0, 0], [-3, 0, 0], [-1, 0, 0], [0, 0, 2], [0, 0, -2], [0, 1, 0], [0, -1, 0]]
+
+    axes = own_axes(torch.tensor([x]))[0]
+
+    first, second, third = axes.T
+    assert first.tolist() == [1, 0, 0]
+    assert second.abs().tolist() == [0, 0, 1]
+    torch.testing.assert_close(third, torch.linalg.cross(first, second))
+
+
+def test_own_axes_are_rotations(rng):
+    clouds = torch.randn(5, 40, 3, dtype=torch.float64, generator=rng)
+
+    axes = own_axes(clouds - clouds.mean(1, keepdim=True))
+
+    torch.testing.assert_close(axes.mT @ axes, torch.eye(3).double().expand(5, 3, 3))
+    torch.testing.assert_close(torch.linalg.det(axes), torch.ones(5).double())
+
+
+@pytest.mark.parametrize("number", [1, 2, 3, 9])
+@pytest.mark.parametrize("direction", [[0.0, 0.0, 0.0], [1.0, 2.0, 0.5]])
+def test_points_on_one_line_give_finite_coordinates(number, direction):
+    points = torch.arange(number)[:, None] * torch.tensor(direction)
+
+    described = in_own_frame(points[None], NO_CHANNELS)[0]
+
+    distances = (points - points.mean(0)).norm(dim=1)
+    torch.testing.assert_close(described[:, 0].abs(), distances)
+    assert described[:, 1:].abs().max() < 1e-5
+
+
+def test_normals_turn_with_the_cloud(rng):
+    clouds, turned, rotations, _ = turned_pair(rng)
+    normals = torch.nn.functional.normalize(
+        torch.randn(clouds.shape, generator=rng).double(), dim=2
+    )
+    channels = PointChannels(map(Channel, ("normal_x", "normal_y", "normal_z")))
+
+    described = in_own_frame(torch.cat([clouds, normals], 2), channels)
+    described_turned = in_own_frame(torch.cat([turned, normals @ rotations.mT], 2), channels)
+
+    torch.testing.assert_close(described, described_turned)
+
+
+def test_own_frame_without_anchors_is_refused():
+    with pytest.raises(UserError, match="own_frame=True needs anchors=fps"):
+        MOPSNet(4, own_frame=True)
