@@ -12,7 +12,7 @@ from mops_lightning.config.groups import conf_dir
 from mops_lightning.config.validate import check, misfit
 from mops_lightning.errors import UserError
 
-SPECIALISED = ("task_settings", "dataset_task")
+SPECIALISED = ("task_settings", "dataset_task", "sampler_recipe")
 """Groups that the defaults list chooses from, not the user; see test_groups."""
 
 

@@ -1,5 +1,7 @@
 """Features in a frame that turns with the cloud: samples turn with it, too."""
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -9,7 +11,7 @@ from mops_lightning.errors import UserError
 from mops_lightning.ops.rigid import quaternion_from_euler, quaternion_to_matrix
 from mops_lightning.samplers.own_frame import in_own_frame, own_axes
 
-LAYERS = {"feature_channels": (8, 6), "rho_channels": (12, 10)}
+LAYERS: dict[str, Any] = {"feature_channels": (8, 6), "rho_channels": (12, 10)}
 
 
 def moved_sampler(own_frame, **settings):
