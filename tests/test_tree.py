@@ -52,13 +52,28 @@ def test_weights_are_models_of_the_package(tracked):
         weights.read(path)
 
 
+def records_of(tracked):
+    """Return the records of all tables and all cards of models."""
+    records = []
+    for path in tracked:
+        if path.name == "runs.jsonl":
+            for line in path.read_text().splitlines():
+                records.append(json.loads(line))
+        elif path.suffix in WEIGHTS:
+            records.append(model_file.read_card(path)["record"])
+    return records
+
+
 def test_records_and_models_name_models_that_exist(tracked):
-    tables = [path for path in tracked if path.name == "runs.jsonl"]
-    records = [json.loads(line) for path in tables for line in path.read_text().splitlines()]
-    records += [model_file.read_card(path)["record"] for path in tracked if path.suffix in WEIGHTS]
-    named = {record["files"][k] for record in records for k in record["files"] if k in KINDS}
-    found = {names.find_model(name) for name in named}
-    assert found == {path for path in tracked if path.suffix in WEIGHTS}
+    models = {path for path in tracked if path.suffix in WEIGHTS}
+
+    named = set()
+    for record in records_of(tracked):
+        for kind, name in record["files"].items():
+            if kind in KINDS:
+                named.add(names.find_model(name))
+
+    assert named == models
 
 
 def test_pages_set_arguments_without_a_plus():

@@ -51,20 +51,29 @@ def test_solve_of_plan_that_is_no_bijection_is_exact(monkeypatch):
     assert np.array_equal(solve_assignment(p, q), linear_sum_assignment(cdist(p, q))[1])
 
 
-@pytest.mark.parametrize(("n", "sizes"), [(64, [16] * 4), (70, [8, 9, 9, 9, 8, 9, 9, 9])])
+@pytest.mark.parametrize(
+    ("n", "sizes"),
+    [
+        (64, [16, 16, 16, 16]),
+        (70, [8, 8, 9, 9, 9, 9, 9, 9]),
+    ],
+)
 @pytest.mark.parametrize("rounds", [1, 2, 3])
 def test_approximate_solves_blocks_that_cover_all_points_in_every_round(n, sizes, rounds, solved):
     p, q = clouds(n)
+    number = len(sizes)
+
     rows = approximate_assignment(p, q, 16, rounds)
+
     assert sorted(rows.tolist()) == list(range(n))
-    counts = len(sizes)
-    assert len(solved) == counts * (rounds + 1)
-    for start in range(0, len(solved), counts):
-        parts = solved[start : start + counts]
-        assert sorted(len(part) for part, _ in parts) == sorted(sizes)
-        for number, cloud in enumerate((p, q)):
-            found = np.concatenate([part[number] for part in parts])
-            assert np.array_equal(np.sort(found, 0), np.sort(cloud, 0))
+    assert len(solved) == number * (rounds + 1)
+    for start in range(0, len(solved), number):
+        blocks = solved[start : start + number]
+        assert sorted(len(block) for block, _ in blocks) == sizes
+        joined_p = np.concatenate([block for block, _ in blocks])
+        joined_q = np.concatenate([block for _, block in blocks])
+        assert np.array_equal(np.sort(joined_p, 0), np.sort(p, 0))
+        assert np.array_equal(np.sort(joined_q, 0), np.sort(q, 0))
 
 
 def test_approximate_cost_never_increases_and_is_fixed():

@@ -47,22 +47,29 @@ def test_keys_equal_plain_form(kind, number, dtype, rng):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("channels", [1, 3, 5])
 def test_keys_in_the_unit_sphere_are_those_of_the_moved_cloud(kind, channels, rng):
-    points = cloud_of(kind, (2, 400), torch.float64, rng).repeat(1, 1, 2)[..., :channels]
+    cloud = cloud_of(kind, (2, 400), torch.float64, rng)
+    points = torch.cat([cloud, cloud], 2)[..., :channels]
 
     keys = seeded_keys(points.numpy(), SeededOrder(4, in_sphere=True))
 
-    assert (keys == seeded_keys(in_unit_sphere(points).numpy(), SeededOrder(4))).all()
+    moved = in_unit_sphere(points).numpy()
+    expected = seeded_keys(moved, SeededOrder(4))
+    assert (keys == expected).all()
 
 
 def test_unit_spheres_have_the_exact_mean_in_any_order(rng):
     points = torch.randn(2, 5000, 3, generator=rng, dtype=torch.float64).numpy() + 1e6
 
     spheres = unit_spheres(points)
+    spheres_of_reversed = unit_spheres(points[:, ::-1])
 
-    assert (unit_spheres(points[:, ::-1]) == spheres).all()
-    np.testing.assert_allclose(spheres[:, :3], points.mean(1), rtol=1e-14)
-    radius = np.linalg.norm(points - spheres[:, None, :3], axis=2).max(1)
-    np.testing.assert_allclose(spheres[:, 3], radius, rtol=1e-14)
+    centres = spheres[:, :3]
+    radii = spheres[:, 3]
+    assert (spheres_of_reversed == spheres).all()
+    np.testing.assert_allclose(centres, points.mean(1), rtol=1e-14)
+    from_centre = points - centres[:, None]
+    farthest = np.linalg.norm(from_centre, axis=2).max(1)
+    np.testing.assert_allclose(radii, farthest, rtol=1e-14)
 
 
 def test_unit_sphere_of_equal_points_has_radius_1():

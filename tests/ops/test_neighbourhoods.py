@@ -12,12 +12,13 @@ from tests.ops.test_stability import box
 
 def plain_ellipsoid(points, rows, place):
     """Compute the spread of one neighbourhood by NumPy's eigenvectors."""
-    mean = points[rows].mean(0)
-    variances, axes = np.linalg.eigh(np.cov(points[rows].T, bias=True))
-    offset = points[place] - mean
-    above = abs(offset @ axes[:, 0])
-    beside = np.linalg.norm(offset - offset @ axes[:, 0] * axes[:, 0])
-    return [*np.sqrt(variances), above, beside], axes[:, 0]
+    near = points[rows]
+    variances, axes = np.linalg.eigh(np.cov(near.T, bias=True))
+    normal = axes[:, 0]
+    offset = points[place] - near.mean(0)
+    height = offset @ normal
+    beside = np.linalg.norm(offset - height * normal)
+    return [*np.sqrt(variances), abs(height), beside], normal
 
 
 def test_ellipsoids_equal_eigenvectors_of_numpy():
@@ -52,11 +53,13 @@ def test_features_of_coincident_points_are_finite(number):
 
 
 def test_features_tell_a_border_from_the_middle_of_a_plane():
-    x, y = np.meshgrid(np.arange(15.0), np.arange(15.0))
-    plane = np.stack([x.ravel(), y.ravel(), np.zeros(225)], axis=1)
-    middle, corner = 7 * 15 + 7, 0
+    ticks = np.arange(15.0)
+    x, y = np.meshgrid(ticks, ticks)
+    plane = np.column_stack([x.ravel(), y.ravel(), np.zeros(225)])
+    corner = 0
+    middle = 7 * 15 + 7
 
     features = describe_neighbourhoods(plane).features
-    beside = features[:, 4]  # distance from the mean of the six nearest points
 
+    beside = features[:, 4]  # distance from the mean of the six nearest points
     assert beside[corner] > beside[middle] + 1

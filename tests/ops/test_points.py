@@ -6,26 +6,51 @@ from mops_lightning.ops.points import UnitSphere, gather_points, normalize_unit_
 
 
 def test_gather_points_equals_double_loop(rng):
-    points = torch.randn(2, 7, 4, dtype=torch.float64, generator=rng, requires_grad=True)
+    points = torch.randn(2, 7, 4, dtype=torch.float64, generator=rng)
     indices = torch.randint(7, (2, 5), generator=rng)
+
     gathered = gather_points(points, indices)
+
     for b in range(2):
         for j in range(5):
             assert torch.equal(gathered[b, j], points[b, indices[b, j]])
-    nested = indices[:, :4].unflatten(1, (2, 2))
-    assert torch.equal(gather_points(points, nested), gathered[:, :4].unflatten(1, (2, 2)))
-    assert torch.autograd.gradcheck(lambda p: gather_points(p, indices), (points,))
+
+
+def test_gather_points_of_nested_indices_equals_that_of_flat_ones(rng):
+    points = torch.randn(2, 7, 4, dtype=torch.float64, generator=rng)
+    indices = torch.randint(7, (2, 2, 2), generator=rng)
+
+    gathered = gather_points(points, indices)
+
+    flat = gather_points(points, indices.flatten(1))
+    assert torch.equal(gathered, flat.unflatten(1, (2, 2)))
+
+
+def test_gather_points_has_gradients(rng):
+    points = torch.randn(2, 7, 4, dtype=torch.float64, generator=rng, requires_grad=True)
+    indices = torch.randint(7, (2, 5), generator=rng)
+
+    def gathered(points):
+        return gather_points(points, indices)
+
+    assert torch.autograd.gradcheck(gathered, (points,))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_normalize_centres_and_scales(dtype, rng):
     points = 5 + 3 * torch.randn(4, 20, 3, dtype=dtype, generator=rng)
+
     result = normalize_unit_sphere(points)
+
     assert result.dtype == dtype
     assert result.mean(1).abs().max() < 1e-6
-    torch.testing.assert_close(result.norm(dim=2).amax(1), torch.ones(4, dtype=dtype))
-    ratio = (points[:, 1:] - points[:, :1]) / (result[:, 1:] - result[:, :1])
-    torch.testing.assert_close(ratio, ratio[:, :1, :1].expand_as(ratio), rtol=1e-3, atol=0)
+    radii = result.norm(dim=2).amax(1)
+    torch.testing.assert_close(radii, torch.ones(4, dtype=dtype))
+    edges = points[:, 1:] - points[:, :1]
+    scaled_edges = result[:, 1:] - result[:, :1]
+    ratios = edges / scaled_edges
+    of_cloud = ratios[:, :1, :1].expand_as(ratios)
+    torch.testing.assert_close(ratios, of_cloud, rtol=1e-3, atol=0)
 
 
 def test_normalize_of_coincident_points_is_zero():

@@ -48,34 +48,57 @@ def test_full_precision_disables_autocast(rng):
 def test_mops_net_sampling_matrix_is_float32(training, rng):
     points = F.normalize(torch.randn(4, 200, 3, generator=rng), dim=2)
     net = MOPSNet(16).train(training)
-    single = net(points)
-    half = mixed(net, points)
-    assert half.points.dtype == half.matrix.keys.dtype == torch.float32
-    dense = half.matrix.dense()
+    in_single = net(points).points
+
+    output = mixed(net, points)
+
+    dense = output.matrix.dense()
+    assert output.points.dtype == torch.float32
+    assert output.matrix.keys.dtype == torch.float32
     assert dense.dtype == torch.float32
     torch.testing.assert_close(dense.sum(1), torch.ones(4, 16))
-    torch.testing.assert_close(dense.mT @ points, half.points)
-    assert 0 < (half.points - single.points).abs().max() < 0.02
+    torch.testing.assert_close(dense.mT @ points, output.points)
+    error = (output.points - in_single).abs().max()
+    assert 0 < error < 0.02
+
+
+def pooled_with_gradients(pool, features, direction):
+    """Return maxima in mixed precision, and the gradients of features and weights."""
+    leaf = features.clone().requires_grad_()
+    pooled = mixed(pool, leaf)
+    loss = (pooled * direction).sum()
+    of_features, of_weights = torch.autograd.grad(loss, (leaf, pool.linear.weight))
+    assert pooled.dtype == torch.float32
+    assert of_features.dtype == features.dtype
+    assert of_weights.dtype == torch.float32
+    return pooled.detach(), of_features.float(), of_weights
 
 
 @pytest.mark.parametrize("n", [PLAIN_MAX_POINTS, 100])
 @pytest.mark.parametrize("norm", [True, False])
 def test_max_pool_half_precision_is_close_with_its_gradients(n, norm, rng):
     # Small whole numbers: their products are exact in half precision, so the same points win.
-    features = torch.randint(-2, 3, (3, n, 16), generator=rng)
+    features = torch.randint(-2, 3, (3, n, 16), generator=rng).float()
     pool = PointMaxPool(16, 64, norm)
     pool.linear.weight.data = torch.randint(-3, 4, (64, 16), generator=rng).float()
-    results, weights = [], torch.randn(3, 64, generator=rng)
-    for kind in (torch.float32, torch.bfloat16):
-        leaf = features.to(kind).requires_grad_()
-        pooled = mixed(pool, leaf)
-        loss = (pooled * weights).sum()
-        to_leaf, to_weight = torch.autograd.grad(loss, (leaf, pool.linear.weight))
-        assert pooled.dtype == torch.float32
-        assert to_leaf.dtype == kind
-        assert to_weight.dtype == torch.float32
-        results.append((pooled.detach(), to_leaf.float(), to_weight))
-    torch.testing.assert_close(results[1], results[0], rtol=0.02, atol=0.02)
+    direction = torch.randn(3, 64, generator=rng)
+
+    in_single = pooled_with_gradients(pool, features, direction)
+    in_half = pooled_with_gradients(pool, features.bfloat16(), direction)
+
+    torch.testing.assert_close(in_half, in_single, rtol=0.02, atol=0.02)
+
+
+def output_and_gradients(net, arguments):
+    """Return what a net gives, and the gradients of its weights, in float32."""
+    output = net(*arguments)
+    if isinstance(output, Motion):
+        output = output.quaternion
+    output = output.float()
+    net.zero_grad()
+    output[..., 1].sum().backward()
+    gradients = [p.grad.flatten() for p in net.parameters() if p.grad is not None]
+    return output.detach(), torch.cat(gradients)
 
 
 @pytest.mark.parametrize(
@@ -87,14 +110,10 @@ def test_nets_under_plain_autocast_are_close(make, rng):
     net = make()
     points = torch.randn(4, 60, 3, generator=rng)
     arguments = (points, points + 0.1) if isinstance(net, PCRNet) else (points,)
-    results = []
-    for autocast in (False, True):
-        with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
-            made = net(*arguments)
-        result = (made.quaternion if isinstance(made, Motion) else made).float()
-        net.zero_grad()
-        result[..., 1].sum().backward()
-        gradients = [p.grad.flatten() for p in net.parameters() if p.grad is not None]
-        results.append((result.detach(), torch.cat(gradients)))
-    torch.testing.assert_close(results[1][0], results[0][0], rtol=0.05, atol=0.05)
-    assert F.cosine_similarity(results[1][1], results[0][1], dim=0) > 0.9
+    expected, expected_gradients = output_and_gradients(net, arguments)
+
+    with torch.autocast("cpu", torch.bfloat16):
+        output, gradients = output_and_gradients(net, arguments)
+
+    torch.testing.assert_close(output, expected, rtol=0.05, atol=0.05)
+    assert F.cosine_similarity(gradients, expected_gradients, dim=0) > 0.9

@@ -1,3 +1,4 @@
+import copy
 from typing import Any
 
 import pytest
@@ -11,34 +12,44 @@ from mops_lightning.samplers.ordering import seeded_order
 from tests.support.plain import plain_farthest
 
 
+def plain_contributions(features):
+    """Return the sum of the maxima of channels that each point has."""
+    contributions = [0.0] * len(features)
+    for channel in features.T:
+        contributions[int(channel.argmax())] += float(channel.max())
+    return contributions
+
+
 @torch.no_grad()
 def test_critical_equals_plain_ranking(rng):
     net = PointNetVanilla(3).eval()
     points = torch.randn(3, 60, 3, generator=rng)
-    rows = CriticalSampler(20, net)(points).indices
-    for cloud, chosen in zip(net.point_features(points), rows.tolist(), strict=True):
-        contribution = [0.0] * 60
-        for channel in cloud.T:
-            contribution[int(channel.argmax())] += float(channel.max())
-        number = min(20, sum(value > 0 for value in contribution))
-        want = sorted(range(60), key=lambda row: -contribution[row])
-        assert chosen[:number] == want[:number]
+
+    indices = CriticalSampler(20, net)(points).indices
+
+    for features, rows in zip(net.point_features(points), indices.tolist(), strict=True):
+        contributions = plain_contributions(features)
+        contributing = sum(value > 0 for value in contributions)
+        number = min(20, contributing)
+        expected = sorted(range(60), key=lambda row: -contributions[row])
+        assert rows[:number] == expected[:number]
+
+
+def modes_of(net):
+    return [module.training for module in net.modules()]
 
 
 def test_critical_leaves_net_as_it_is(rng):
     net: Any = PointNetVanilla(3)
     net.pool.eval()
-    modes = [module.training for module in net.modules()]
-    before = {name: value.clone() for name, value in net.state_dict().items()}
+    modes = modes_of(net)
+    before = copy.deepcopy(net.state_dict())
     sampler = CriticalSampler(4, net)
+
     sampler(torch.randn(2, 40, 3, generator=rng))
-    assert all(torch.equal(value, before[name]) for name, value in net.state_dict().items())
-    net.point_features = None
-    with pytest.raises(TypeError):
-        sampler(torch.randn(2, 40, 3, generator=rng))
-    assert [module.training for module in net.modules()] == modes
-    assert not sampler.learned
-    assert not sampler.state_dict()
+
+    assert modes_of(net) == modes
+    torch.testing.assert_close(net.state_dict(), before, atol=0, rtol=0)
 
 
 def test_critical_large_batch_equals_small_ones(rng, monkeypatch):
@@ -99,3 +110,16 @@ def test_critical_ties_keep_seeded_order(rng):
     for seed in (0, 1):
         rows = CriticalSampler(20, OwnChannels(), seed)(points).indices
         assert torch.equal(rows, seeded_order(points, seed)[:, :20])
+
+
+def test_critical_leaves_modes_of_a_failing_net_as_they_are(rng):
+    net: Any = PointNetVanilla(3)
+    net.pool.eval()
+    modes = modes_of(net)
+    sampler = CriticalSampler(4, net)
+    net.point_features = None
+
+    with pytest.raises(TypeError):
+        sampler(torch.randn(2, 40, 3, generator=rng))
+
+    assert modes_of(net) == modes

@@ -27,21 +27,35 @@ def test_fps_sampler_uses_start(rng):
 def test_fps_sampler_with_weights_starts_at_the_heaviest_point(rng):
     points = torch.randn(20, 50, 3, generator=rng)
     weight = torch.rand(20, 50, generator=rng)
+    sampler = FPSSampler(3)
+    from_row_7 = FPSSampler(3, start=7)
 
-    chosen = FPSSampler(3).sample_weighted(points, 3, weight)
-    from_row = FPSSampler(3, start=7).sample_weighted(points, 3, weight)
+    rows = sampler.sample_weighted(points, 3, weight)
+    rows_from_7 = from_row_7.sample_weighted(points, 3, weight)
 
-    assert torch.equal(chosen[:, 0], weight.argmax(1))
-    assert from_row[:, 0].tolist() == [7] * 20
+    assert torch.equal(rows[:, 0], weight.argmax(1))
+    assert rows_from_7[:, 0].tolist() == [7] * 20
+
+
+def test_fps_sampler_farthest_start_equals_plain_form(rng):
+    points = torch.randn(3, 50, 3, generator=rng)
+
+    indices = FPSSampler(12, start="farthest")(points).indices
+
+    for cloud, rows in zip(points, indices, strict=True):
+        from_mean = (cloud - cloud.mean(0)).norm(dim=1)
+        farthest = int(from_mean.argmax())
+        assert rows.tolist() == plain_farthest(cloud, [farthest], 12)
 
 
 def test_fps_sampler_farthest_start_moves_with_the_cloud(rng):
     points = torch.randn(3, 50, 3, generator=rng)
-    sampler = FPSSampler(12, start="farthest")
-    chosen = sampler(points).indices
-    first = (points - points.mean(1, keepdim=True)).norm(dim=2).argmax(1)
-    for b in range(3):
-        assert chosen[b].tolist() == plain_farthest(points[b], [int(first[b])], 12)
-    turn = torch.linalg.qr(torch.randn(3, 3, generator=rng)).Q
+    rotation, _ = torch.linalg.qr(torch.randn(3, 3, generator=rng))
     order = torch.randperm(50, generator=rng)
-    assert torch.equal(order[sampler(points[:, order] @ turn + 1).indices], chosen)
+    moved = points[:, order] @ rotation + 1
+    sampler = FPSSampler(12, start="farthest")
+
+    indices = sampler(points).indices
+    indices_of_moved = sampler(moved).indices
+
+    assert torch.equal(order[indices_of_moved], indices)

@@ -5,17 +5,22 @@ from mops_lightning.samplers.serial import SerialSampler, morton_codes
 
 def plain_code(cell):
     """Interleave the bits of x, y and z, the highest first."""
-    bits = "".join(
-        bit for place in zip(*(f"{axis:021b}" for axis in cell), strict=True) for bit in place
-    )
+    x, y, z = (f"{axis:021b}" for axis in cell)
+    bits = ""
+    for bits_of_place in zip(x, y, z, strict=True):
+        bits += "".join(bits_of_place)
     return int(bits, 2)
 
 
 def test_codes_interleave_the_bits_of_the_cells(rng):
     cells = torch.randint(2**21, (50, 3), generator=rng)
-    cells[0], cells[1] = 0, 2**21 - 1  # the cube is the cloud's
-    codes = morton_codes(cells.double()[None])[0].tolist()
-    assert codes == [plain_code(cell) for cell in cells.tolist()]
+    cells[0] = 0
+    cells[1] = 2**21 - 1  # the cube is the cloud's
+
+    (codes,) = morton_codes(cells.double()[None])
+
+    expected = [plain_code(cell) for cell in cells.tolist()]
+    assert codes.tolist() == expected
 
 
 def test_serial_takes_every_kth_point_along_the_curve(rng):
@@ -26,9 +31,15 @@ def test_serial_takes_every_kth_point_along_the_curve(rng):
 
 
 def test_serial_of_all_points_keeps_each_once():
-    points = torch.tensor([[[1.0, 2.0, 3.0]] * 5, [[0.0, 0.0, 0.0]] * 4 + [[9.0, 9.0, 9.0]]])
-    assert SerialSampler(5)(points).indices.sort(1).values.tolist() == [[0, 1, 2, 3, 4]] * 2
-    assert SerialSampler(1)(points).indices.shape == (2, 1)
+    equal = torch.tensor([1.0, 2.0, 3.0]).repeat(5, 1)
+    with_outlier = torch.zeros(5, 3)
+    with_outlier[4] = 9.0
+    points = torch.stack([equal, with_outlier])
+
+    rows = SerialSampler(5)(points).indices
+
+    assert rows[0].sort().values.tolist() == [0, 1, 2, 3, 4]
+    assert rows[1].sort().values.tolist() == [0, 1, 2, 3, 4]
 
 
 def test_serial_scales_all_axes_of_a_cloud_by_one_number():
@@ -39,3 +50,9 @@ def test_serial_scales_all_axes_of_a_cloud_by_one_number():
     indices = SerialSampler(4)(rod[None]).indices
 
     assert indices.tolist() == [[2, 6, 10, 14]]
+
+
+def test_serial_of_one_point_has_one_row_a_cloud():
+    points = torch.zeros(2, 5, 3)
+
+    assert SerialSampler(1)(points).indices.shape == (2, 1)

@@ -14,29 +14,53 @@ def quaternions(seed, number=50):
 def test_quaternion_distance_is_minimum_over_signs():
     a = quaternions(1)
     b = quaternions(2)
-    plain = torch.minimum((a - b).norm(dim=1), (a + b).norm(dim=1)).mean()
-    torch.testing.assert_close(quaternion_distance(a, b), plain)
-    torch.testing.assert_close(quaternion_distance(-a, b), plain)
-    angle = rotation_angle(a, b)
-    torch.testing.assert_close(quaternion_distance(a, b), (2 * (angle / 4).sin()).mean())
+
+    distance = quaternion_distance(a, b)
+
+    apart = (a - b).norm(dim=1)
+    apart_with_other_sign = (a + b).norm(dim=1)
+    nearer = torch.minimum(apart, apart_with_other_sign)
+    torch.testing.assert_close(distance, nearer.mean())
+    torch.testing.assert_close(quaternion_distance(-a, b), distance)
+    chord = 2 * (rotation_angle(a, b) / 4).sin()
+    torch.testing.assert_close(distance, chord.mean())
 
 
 def test_quaternion_distance_gradient_points_to_nearer_sign():
     true = quaternions(3)
     predicted = (-true + 1e-2).requires_grad_()
-    (gradient,) = torch.autograd.grad(quaternion_distance(predicted, true), predicted)
-    assert ((predicted - gradient + true).norm(dim=1) < (predicted + true).norm(dim=1)).all()
+
+    distance = quaternion_distance(predicted, true)
+    (gradient,) = torch.autograd.grad(distance, predicted)
+
+    before = (predicted + true).norm(dim=1)
+    after = (predicted - gradient + true).norm(dim=1)
+    assert (after < before).all()
+
+
+def test_quaternion_distance_gradient_of_equal_quaternions_is_finite():
+    true = quaternions(3)
     same = true.clone().requires_grad_()
-    assert torch.isfinite(torch.autograd.grad(quaternion_distance(same, true), same)[0]).all()
+
+    distance = quaternion_distance(same, true)
+    (gradient,) = torch.autograd.grad(distance, same)
+
+    assert torch.isfinite(gradient).all()
 
 
 def test_registration_loss_is_zero_at_true_motion_only(rng):
-    true = Motion(quaternions(1), torch.randn(50, 3, dtype=torch.float64, generator=rng))
-    assert sum(quaternion_loss(true, true).values()) < 1e-12
-    other = Motion(quaternions(2), true.translation)
-    assert sum(quaternion_loss(other, true).values()) > 0.1
-    shifted = Motion(true.quaternion, true.translation + 1)
-    assert sum(quaternion_loss(shifted, true).values()) > 0.1
+    translation = torch.randn(50, 3, dtype=torch.float64, generator=rng)
+    true = Motion(quaternions(1), translation)
+    turned = Motion(quaternions(2), translation)
+    shifted = Motion(true.quaternion, translation + 1)
+
+    of_true = quaternion_loss(true, true)
+    of_turned = quaternion_loss(turned, true)
+    of_shifted = quaternion_loss(shifted, true)
+
+    assert sum(of_true.values()) < 1e-12
+    assert sum(of_turned.values()) > 0.1
+    assert sum(of_shifted.values()) > 0.1
 
 
 def test_registration_loss_terms_of_a_shift():

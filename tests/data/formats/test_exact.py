@@ -53,13 +53,15 @@ def test_write_integers_of_64_bits_keep_all_digits(suffix, tmp_path, capsys):
 
 def test_write_integers_beyond_ply_are_refused_and_others_are_kept(tmp_path):
     path = tmp_path / "a.ply"
+    exact_in_float64 = np.arange(20) + 2**50
 
     with pytest.raises(UserError, match=r"no type for 'stamp'.*Write \.npz or \.las"):
         write(path, Table(NEAR_ORIGIN, {"stamp": NANOSECONDS}))
     assert not path.exists()
-    write(path, Table(NEAR_ORIGIN, {"id": np.arange(20) + 2**50}))
+    write(path, Table(NEAR_ORIGIN, {"id": exact_in_float64}))
 
-    np.testing.assert_array_equal(read(path, 9, 0).columns["id"], np.arange(20) + 2**50)
+    columns = read(path, 9, 0).columns
+    np.testing.assert_array_equal(columns["id"], exact_in_float64)
 
 
 def test_ascii_pcd_integers_of_64_bits_keep_all_digits(tmp_path):
@@ -123,26 +125,6 @@ def test_text_of_float32_has_the_fewest_digits_of_its_type(tmp_path):
     np.testing.assert_array_equal(np.array(text.split(), np.float32), single[0])
 
 
-def test_npz_keeps_arrays_and_names_and_says_what_is_left_out(tmp_path, capsys):
-    normals = NEAR_ORIGIN.astype(np.float32)
-    arrays: dict[str, Any] = {"xyz": NEAR_ORIGIN, "normals": normals, "my name": normals[:, 0]}
-    np.savez(tmp_path / "in.npz", allow_pickle=False, **arrays)
-    table = read(tmp_path / "in.npz", 9, 0)
-    arrays["file"] = np.arange(20)  # numpy.savez takes no array of this name
-    table = replace(table, columns={**table.columns, "file": arrays["file"]})
-
-    write(tmp_path / "out.npz", table)
-
-    again = np.load(tmp_path / "out.npz")
-    assert set(again) == set(arrays)
-    for name, array in arrays.items():
-        assert again[name].dtype == array.dtype
-        np.testing.assert_array_equal(again[name], array)
-    np.savez(tmp_path / "in.npz", points=NEAR_ORIGIN, pose=np.eye(4), names=["a"] * 20)
-    write(tmp_path / "out.ply", read(tmp_path / "in.npz", 9, 0))
-    assert "out.ply: without pose, names" in capsys.readouterr().out
-
-
 def test_pcd_keeps_fields_of_several_numbers_and_viewpoint(tmp_path):
     head = (
         "FIELDS x y z fpfh\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 2\nWIDTH 1\n"
@@ -163,3 +145,33 @@ def test_coordinates_beyond_float64_are_refused(tmp_path):
 
     with pytest.raises(UserError, match="x has numbers that float64 does not hold exactly"):
         read(tmp_path / "a.npy", 9, 0)
+
+
+def test_npz_keeps_arrays_and_names(tmp_path):
+    source = tmp_path / "in.npz"
+    target = tmp_path / "out.npz"
+    normals = NEAR_ORIGIN.astype(np.float32)
+    rows = np.arange(20)
+    arrays: dict[str, Any] = {"xyz": NEAR_ORIGIN, "normals": normals, "my name": normals[:, 0]}
+    np.savez(source, allow_pickle=False, **arrays)
+    table = read(source, 9, 0)
+    # numpy.savez takes no array of this name
+    columns = {**table.columns, "file": rows}
+
+    write(target, replace(table, columns=columns))
+
+    again = np.load(target)
+    assert set(again) == {"xyz", "normals", "my name", "file"}
+    np.testing.assert_array_equal(again["file"], rows)
+    for name, array in arrays.items():
+        assert again[name].dtype == array.dtype
+        np.testing.assert_array_equal(again[name], array)
+
+
+def test_arrays_of_npz_that_are_left_out_are_said(tmp_path, capsys):
+    source = tmp_path / "in.npz"
+    np.savez(source, points=NEAR_ORIGIN, pose=np.eye(4), names=["a"] * 20)
+
+    write(tmp_path / "out.ply", read(source, 9, 0))
+
+    assert "out.ply: without pose, names" in capsys.readouterr().out

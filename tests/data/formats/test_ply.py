@@ -1,5 +1,7 @@
 """PLY files."""
 
+import struct
+
 import numpy as np
 import pytest
 import trimesh
@@ -36,14 +38,19 @@ HEADS = {
 
 @pytest.mark.parametrize("kind", HEADS)
 def test_ply_header_variant_is_read(kind, tmp_path):
-    points = np.random.default_rng(1).normal(size=(50, 3)).astype(np.float32).astype(float)
     path = tmp_path / "a.ply"
-    WRITERS[".ply"](path, Table(points, {"red": np.arange(50, dtype=np.uint8)}))
+    points = np.random.default_rng(1).normal(size=(50, 3)).astype(np.float32).astype(float)
+    red = np.arange(50, dtype=np.uint8)
+    WRITERS[".ply"](path, Table(points, {"red": red}))
     head, end, rows = path.read_bytes().partition(b"end_header\n")
-    path.write_bytes((head + end).decode().replace(*HEADS[kind]).encode() + rows)
+    usual, variant = HEADS[kind]
+    changed = (head + end).decode().replace(usual, variant)
+    path.write_bytes(changed.encode() + rows)
+
     table = open_cloud_file(path).read(range(10, 50))
+
     np.testing.assert_array_equal(table.points, points[10:])
-    np.testing.assert_array_equal(table.columns["red"], np.arange(10, 50))
+    np.testing.assert_array_equal(table.columns["red"], red[10:])
 
 
 def test_ply_vertices_with_lists_are_rejected(tmp_path):
@@ -63,20 +70,39 @@ def test_ply_chunked_impossible_count_is_broken(tmp_path):
         open_cloud_file(path)
 
 
+def two_rows(form, end):
+    """Return the rows (1, 2, 3) and (4, 5, 10) of a PLY file."""
+    if form == "ascii":
+        return f"1 2 3{end}4 5 10{end}".encode()
+    order = ">" if form == "binary_big_endian" else "<"
+    return struct.pack(f"{order}6f", 1, 2, 3, 4, 5, 10)  # 10 is the byte of a line end
+
+
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
 def test_ply_line_ends_and_latin_comments_are_read(end, form, tmp_path):
     path = tmp_path / "a.ply"
-    lines = ["ply", "comment größe", f"format {form} 1.0", "comment é", "element vertex 2"]
-    lines += [f"property float {axis}" for axis in "xyz"]
-    points = np.array([[1, 2, 3], [4, 5, 10]], "<f4")  # its last bytes hold a line end
-    stored = points.astype(">f4") if form == "binary_big_endian" else points
-    body = stored.tobytes() if form != "ascii" else f"1 2 3{end}4 5 10{end}".encode()
-    head = end.join([*lines, "end_header", ""])
-    path.write_bytes(head.encode("latin-1") + body)
-    np.testing.assert_array_equal(read(path, 9, 0).points, points)
+    lines = [
+        "ply",
+        "comment größe",
+        f"format {form} 1.0",
+        "comment é",
+        "element vertex 2",
+        "property float x",
+        "property float y",
+        "property float z",
+        "end_header",
+        "",
+    ]
+    head = end.join(lines).encode("latin-1")
+    path.write_bytes(head + two_rows(form, end))
+
+    points = read(path, 9, 0).points
+
+    assert points.tolist() == [[1, 2, 3], [4, 5, 10]]
     if form != "ascii":
-        np.testing.assert_array_equal(open_cloud_file(path).read(range(2)).points, points)
+        rows = open_cloud_file(path).read(range(2))
+        assert rows.points.tolist() == [[1, 2, 3], [4, 5, 10]]
 
 
 def test_ply_texture_comment_opens_no_file(tmp_path, monkeypatch):
