@@ -2,6 +2,7 @@
 
 import os
 import signal
+from functools import cache
 
 import pytest
 from lightning.pytorch.callbacks import Callback
@@ -51,10 +52,25 @@ def interrupt(name):
     signal.raise_signal(getattr(signal, name))
 
 
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory):
+    """A function that returns the folder of an unbroken training, which is run once."""
+
+    @cache
+    def trained(name):
+        settings, _ = ENDED_BY[name]
+        folder = tmp_path_factory.mktemp("unbroken")
+        done([*LONG, *settings, "hydra.run.dir=run"], folder)
+        return folder / "run"
+
+    return trained
+
+
 @pytest.mark.parametrize("name", ENDED_BY)
-def test_ended_training_stopped_in_its_test_is_not_trained_on(name, tmp_path, monkeypatch):
+def test_ended_training_stopped_in_its_test_is_not_trained_on(
+    name, unbroken, tmp_path, monkeypatch
+):
     settings, _ = ENDED_BY[name]
-    done([*LONG, *settings, "hydra.run.dir=unbroken"], tmp_path)
     with monkeypatch.context() as patched:
         patched.setattr(Experiment, "on_test_start", lambda _: interrupt("SIGINT"))
         status, _, err = call([*LONG, *settings, "hydra.run.dir=stopped"], tmp_path)
@@ -62,28 +78,28 @@ def test_ended_training_stopped_in_its_test_is_not_trained_on(name, tmp_path, mo
 
     out = done([*LONG, *settings, "hydra.run.dir=resumed", "ckpt_path=stopped"], tmp_path)
 
-    assert ended(tmp_path / "resumed") == ended(tmp_path / "unbroken")
+    assert ended(tmp_path / "resumed") == ended(unbroken(name))
     assert "stopped/checkpoints/last.ckpt: this training had ended after" in out
 
 
 @pytest.mark.parametrize("name", ["early stopping", "a callback"])
-def test_completed_training_resumed_with_more_epochs_keeps_its_ending(name, tmp_path):
+def test_completed_training_resumed_with_more_epochs_keeps_its_ending(name, unbroken, tmp_path):
     settings, steps = ENDED_BY[name]
-    done([*LONG, *settings, "hydra.run.dir=first"], tmp_path)
-    more = ["hydra.run.dir=again", "ckpt_path=first", "trainer.max_epochs=9"]
+    first = unbroken(name)
+    more = ["hydra.run.dir=again", f"ckpt_path={first}", "trainer.max_epochs=9"]
 
     out = done([*LONG, *settings, *more], tmp_path)
 
-    assert ended(tmp_path / "again")[:2] == ended(tmp_path / "first")[:2]
+    assert ended(tmp_path / "again")[:2] == ended(first)[:2]
     assert not run_record.read(tmp_path / "again").lengthened
     assert f"had ended after {steps // 2} epochs" in out
 
 
 def test_callback_that_asks_before_min_epochs_ends_at_min_epochs_after_a_stop(
-    tmp_path, monkeypatch
+    unbroken, tmp_path, monkeypatch
 ):
-    settings, _ = ENDED_BY["a callback, but min_epochs"]
-    done([*LONG, *settings, "hydra.run.dir=unbroken"], tmp_path)
+    name = "a callback, but min_epochs"
+    settings, _ = ENDED_BY[name]
 
     def stop_in_third_epoch(self, _):
         if self.global_step == 4:
@@ -96,7 +112,7 @@ def test_callback_that_asks_before_min_epochs_ends_at_min_epochs_after_a_stop(
 
     done([*LONG, *settings, "hydra.run.dir=resumed", "ckpt_path=stopped"], tmp_path)
 
-    assert ended(tmp_path / "resumed") == ended(tmp_path / "unbroken")
+    assert ended(tmp_path / "resumed") == ended(unbroken(name))
 
 
 def test_training_stopped_twice_after_its_last_validation_keeps_it(tmp_path, monkeypatch):

@@ -3,6 +3,7 @@
 import json
 import math
 import shutil
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -19,36 +20,61 @@ from mops_lightning.zoo import model_file, names
 from tests.support.command_line import TINY, call, done
 from tests.support.reports import rows
 
+FPS = ("sampler=fps", "weights=null")
+TRAINED = ("sampler=mops", "weights=null", "trainer.max_epochs=2")
+
+
+def run_in(folder, arguments):
+    """Run the cell of a folder, as a sweep does; its score."""
+    overrides = [*TINY, f"cache={folder}/cache", *arguments]
+    return run_cell(compose(overrides), folder / "cell", overrides)
+
 
 @pytest.fixture
 def start(tmp_path):
     """Start the cell, as a sweep does each time."""
-
-    def cell(*arguments):
-        overrides = [*TINY, f"cache={tmp_path}/cache", *arguments]
-        return run_cell(compose(overrides), tmp_path / "cell", overrides)
-
-    return cell
+    return lambda *arguments: run_in(tmp_path, arguments)
 
 
-def test_run_cell_completed_is_skipped(start, tmp_path):
-    score = start("sampler=fps", "weights=null")
+@pytest.fixture(scope="module")
+def completed(tmp_path_factory):
+    """A function that returns the folder of a completed cell, which is run once, and its score."""
+
+    @cache
+    def run_once(arguments):
+        folder = tmp_path_factory.mktemp("completed")
+        return folder, run_in(folder, arguments)
+
+    return run_once
+
+
+@pytest.fixture
+def complete(completed, tmp_path):
+    """A function that puts a completed cell into the test's folder; its score."""
+
+    def copied(*arguments):
+        folder, score = completed(arguments)
+        shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+        return score
+
+    return copied
+
+
+def test_run_cell_completed_is_skipped(start, complete, tmp_path):
+    score = complete(*FPS)
     path = tmp_path / "cell" / run_record.FILE
     before = path.stat().st_mtime_ns
-    assert (
-        start("sampler=fps", "weights=null", "pictures=1", "out=elsewhere", "dataset.cache=there")
-        == score
-    )
+    assert start(*FPS, "pictures=1", "out=elsewhere", "dataset.cache=there") == score
     assert path.stat().st_mtime_ns == before
     assert not (tmp_path / "cell" / ASIDE).exists()
 
 
-def test_run_cell_other_settings_keeps_result(start, tmp_path, caplog):
-    score = start("sampler=fps", "weights=null")
-    assert math.isnan(start("sampler=fps", "weights=null", "seed=3"))
+def test_run_cell_other_settings_keeps_result(start, complete, tmp_path, caplog):
+    score = complete(*FPS)
+    assert math.isnan(start(*FPS, "seed=3"))
     assert "other settings: seed was 0, got 3" in caplog.text
     assert "hydra.sweep.dir" in (tmp_path / "cell" / FAILED).read_text()
-    assert start("sampler=fps", "weights=null") == score
+    assert start(*FPS) == score
     assert not (tmp_path / "cell" / FAILED).exists()
 
 
@@ -75,47 +101,45 @@ def test_run_cell_failed_is_repeated(start, tmp_path, caplog):
     assert run_record.read(tmp_path / "cell" / ASIDE / "1").status == "failed"
 
 
-def test_run_cell_failed_with_checkpoint_starts_again(start, tmp_path):
-    longer = ["sampler=mops", "weights=null", "trainer.max_epochs=2"]
-    score = start(*longer)
+def test_run_cell_failed_with_checkpoint_starts_again(start, complete, tmp_path):
+    score = complete(*TRAINED)
     whole = run_record.read(tmp_path / "cell")
     failed = {**whole.plain(), "status": "failed", "score": None}
     (tmp_path / "cell" / run_record.FILE).write_text(json.dumps(failed))
     assert (tmp_path / "cell" / "checkpoints" / "last.ckpt").is_file()
 
-    again = start(*longer)
+    again = start(*TRAINED)
 
     assert again == score
     assert run_record.read(tmp_path / "cell").resumed_from is None
 
 
-def test_run_cell_interrupted_resumes_to_same_result(start, tmp_path):
-    longer = ["sampler=mops", "weights=null", "trainer.max_epochs=2"]
-    score = start(*longer)
+def test_run_cell_interrupted_resumes_to_same_result(start, complete, tmp_path):
+    score = complete(*TRAINED)
     whole = run_record.read(tmp_path / "cell")
     # What a killed process leaves: a record that says "running", and its last checkpoint.
     path = tmp_path / "cell" / run_record.FILE
     path.write_text(json.dumps({**whole.plain(), "status": "running", "score": None}))
-    assert start(*longer) == score
+    assert start(*TRAINED) == score
     again = run_record.read(tmp_path / "cell")
     assert again.metrics == whole.metrics
     assert str(again.resumed_from).endswith(f"{ASIDE}/1/checkpoints/last.ckpt")
-    assert start(*longer) == score
+    assert start(*TRAINED) == score
     # Cut off again before it has a checkpoint of its own, or a record: the first one still counts.
     (tmp_path / "cell" / "checkpoints" / "last.ckpt").unlink(missing_ok=True)
     path.write_text(json.dumps({**again.plain(), "status": "interrupted", "score": None}))
-    assert start(*longer) == score
+    assert start(*TRAINED) == score
     for name in (run_record.FILE, "weights.safetensors"):
         (tmp_path / "cell" / name).unlink()
     (tmp_path / "cell" / "checkpoints" / "last.ckpt").unlink(missing_ok=True)
-    assert start(*longer) == score
+    assert start(*TRAINED) == score
     resumed = str(run_record.read(tmp_path / "cell").resumed_from)
     assert resumed.endswith(f"{ASIDE}/1/checkpoints/last.ckpt")
     # Of two checkpoints the newer one counts.
     (tmp_path / "cell" / "checkpoints").mkdir(exist_ok=True)
     shutil.copy(resumed, tmp_path / "cell" / "checkpoints")
     path.write_text(json.dumps({**again.plain(), "status": "interrupted", "score": None}))
-    assert start(*longer) == score
+    assert start(*TRAINED) == score
     resumed = str(run_record.read(tmp_path / "cell").resumed_from)
     assert resumed.endswith(f"{ASIDE}/3/checkpoints/last.ckpt")
 
@@ -125,8 +149,10 @@ class Killed(BaseException):
 
 
 @pytest.mark.parametrize("number", [1, 3, 5])
-def test_run_cell_killed_while_setting_aside_recovers(start, tmp_path, monkeypatch, number):
-    score = start("sampler=fps", "weights=null")
+def test_run_cell_killed_while_setting_aside_recovers(
+    start, complete, tmp_path, monkeypatch, number
+):
+    score = complete(*FPS)
     cell = tmp_path / "cell"
     record = run_record.read(cell)
     (cell / run_record.FILE).write_text(json.dumps({**record.plain(), "status": "interrupted"}))
@@ -145,22 +171,21 @@ def test_run_cell_killed_while_setting_aside_recovers(start, tmp_path, monkeypat
     with monkeypatch.context() as patch:
         patch.setattr(Path, "rename", rename_or_die)
         with pytest.raises(Killed):
-            start("sampler=fps", "weights=null")
-    assert start("sampler=fps", "weights=null") == score
+            start(*FPS)
+    assert start(*FPS) == score
     assert run_record.read(cell).status == "completed"
     assert {path.name for path in (cell / ASIDE / "1").iterdir()} == moved
     assert [path.name for path in (cell / ASIDE).iterdir()] == ["1"]
 
 
 @pytest.mark.parametrize("name", ["checkpoints/last.ckpt", run_record.FILE])
-def test_run_cell_damaged_file_fails_and_names_it(name, start, tmp_path, caplog):
-    longer = ["sampler=mops", "weights=null", "trainer.max_epochs=2"]
-    start(*longer)
+def test_run_cell_damaged_file_fails_and_names_it(name, start, complete, tmp_path, caplog):
+    complete(*TRAINED)
     cell = tmp_path / "cell"
     record = run_record.read(cell)
     (cell / run_record.FILE).write_text(json.dumps({**record.plain(), "status": "running"}))
     (cell / name).write_bytes((cell / name).read_bytes()[:1000])
-    assert math.isnan(start(*longer))
+    assert math.isnan(start(*TRAINED))
     assert f"{Path(name).name}" in caplog.text
 
 
