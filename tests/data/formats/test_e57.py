@@ -60,7 +60,8 @@ def test_read_e57_joins_scans_at_their_poses(tmp_path):
 def test_downsample_e57_leaves_invalid_points_out(tmp_path):
     path = tmp_path / "a.e57"
     invalid = np.zeros(30, np.int8)
-    invalid[:4] = 1
+    invalid[:3] = 1
+    invalid[3] = 2  # only its direction is valid
     with pye57.E57(str(path), mode="w") as file:
         file.write_scan_raw(scan(1, cartesianInvalidState=invalid))
 
