@@ -213,6 +213,24 @@ def test_geotiff_keys_are_converted(tmp_path):
         assert reader.header.global_encoding.wkt
 
 
+@pytest.mark.parametrize("form", [1, 3, 6, 7])
+def test_copc_says_that_a_coordinate_system_is_in_wkt_as_new_formats_require(form, tmp_path):
+    source = tmp_path / "a.las"
+    out = tmp_path / "out.copc.laz"
+    cloud = full_cloud(form)
+    cloud.header.global_encoding.wkt = False
+    cloud.write(source)
+
+    write(out, read(source, 1, 0))
+
+    before = laspy.read(source).header.global_encoding
+    with laspy.CopcReader.open(out) as reader:
+        after = reader.header.global_encoding
+    assert not before.wkt
+    assert after.wkt
+    assert after.gps_time_type == before.gps_time_type
+
+
 def test_geotiff_keys_need_pyproj(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyproj", None)
     source = tmp_path / "a.laz"
