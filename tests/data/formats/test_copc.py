@@ -111,6 +111,22 @@ def test_levels_are_even_samples(small_cells, tmp_path):
         assert len(points) <= 1.4 * side**2
 
 
+@pytest.mark.parametrize(("share_of_side", "level"), [(1.01 / 128, 0), (0.99 / 128, 1)])
+def test_resolution_is_compared_with_one_128th_of_the_side(
+    small_cells, tmp_path, share_of_side, level
+):
+    out = tmp_path / "out.copc.laz"
+    points = np.random.default_rng(0).uniform(0, 100, (4000, 3))
+    write(out, Table(points))
+    with laspy.CopcReader.open(out) as reader:
+        side = 2 * reader.copc_info.halfsize
+
+    found = read(out, 1, 0, Area(resolution=share_of_side * side)).points
+
+    assert len(found) == len(read(out, 1, 0, Area(level=level)).points)
+    assert len(found) < len(points)
+
+
 def test_area_of_a_written_file_equals_the_points_in_it(small_cells, tmp_path):
     out = tmp_path / "out.copc.laz"
     unit = np.random.default_rng(1).uniform(0, 100, (4000, 3))
