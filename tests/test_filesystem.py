@@ -18,7 +18,20 @@ def test_atomic_write_replaces_the_old_file(tmp_path):
             temporary.write_text(text)
     assert path.read_text() == "new"
     assert list(path.parent.iterdir()) == [path]
-    assert path.stat().st_mode & 0o444
+
+
+@pytest.mark.parametrize(("mask", "mode"), [(0o022, 0o644), (0o077, 0o600), (0o002, 0o664)])
+def test_atomic_write_makes_files_that_others_read_as_the_user_lets_them(mask, mode, tmp_path):
+    path = tmp_path / "file.txt"
+    before = os.umask(mask)
+
+    try:
+        with atomic_write(path) as temporary:
+            temporary.write_text("text")
+    finally:
+        os.umask(before)
+
+    assert path.stat().st_mode & 0o777 == mode
 
 
 def test_atomic_write_after_an_error_keeps_the_old_file(tmp_path):

@@ -1,9 +1,12 @@
 """Weights of points by a column of the file."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from mops_lightning.data.formats.registry import read
+from mops_lightning.data.formats.table import Table
 from mops_lightning.files.column_weights import weights_of
 from tests.support.downsample import call, done
 
@@ -80,6 +83,15 @@ def test_weight_of_a_splat_is_its_opacity(logit, splat):
 
     expected = 1 / (1 + np.exp(-logit))
     assert weight == pytest.approx(expected)
+
+
+def test_weight_of_a_column_named_opacity_outside_of_a_splat_is_its_number():
+    numbers = np.array([0.0, 0.25, 2.0])
+    table = Table(np.eye(3), {"opacity": numbers})
+
+    weight = weights_of(table, "opacity", Path("scan.ply"))
+
+    assert weight.tolist() == [0.0, 0.25, 2.0]
 
 
 def test_completed_set_is_filled_up_by_weight(folder, tmp_path):

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mops_lightning.errors import UserError
-from mops_lightning.files.icp.pairs import crop_pairs, draw_motions, frame_pairs, scans_of
+from mops_lightning.files.icp.pairs import Pair, crop_pairs, draw_motions, frame_pairs, scans_of
 
 SCAN = Path("scan.ply")
 
@@ -92,6 +92,24 @@ def test_starts_are_within_the_angle_and_shift_about_the_mean_of_the_source():
         shifts.append(np.linalg.norm(moved_centre - centre))
     assert 14 < np.degrees(max(angles)) <= 15
     assert 0.09 < max(shifts) <= 0.1
+
+
+def test_starts_of_frames_are_drawn_about_the_true_motion():
+    points = np.random.default_rng(0).normal((20, 0, 0), size=(300, 3))
+    truth = np.eye(4)
+    truth[:3, :3] = Rotation.from_rotvec([0, 0, np.pi / 2]).as_matrix()
+    truth[:3, 3] = 5, 6, 7
+    target = points @ truth[:3, :3].T + truth[:3, 3]
+    pair = Pair(SCAN, points, target, truth)
+
+    (starts,) = draw_motions([pair], 50, angle=15.0, shift=0.1, seed=0)
+
+    true_centre = target.mean(0)
+    for start in starts:
+        turn = Rotation.from_matrix(start[:3, :3] @ truth[:3, :3].T)
+        centre = start[:3, :3] @ points.mean(0) + start[:3, 3]
+        assert np.degrees(turn.magnitude()) <= 15
+        assert np.linalg.norm(centre - true_centre) <= 0.1
 
 
 def test_scans_are_in_the_order_of_their_numbers(tmp_path):
