@@ -1,6 +1,7 @@
 """Headers of LAS that are rare, wrong or new, and second readers of what is written."""
 
 import struct
+from dataclasses import replace
 
 import copclib
 import laspy
@@ -10,7 +11,7 @@ import pytest
 from mops_lightning.data.formats.area import Area
 from mops_lightning.data.formats.las.columns import LasColumns
 from mops_lightning.data.formats.registry import open_cloud_file, read, write
-from mops_lightning.data.formats.table import Table
+from mops_lightning.data.formats.table import Table, TableParts
 from mops_lightning.errors import UserError
 from tests.support.las import full_cloud, header_fields
 
@@ -274,6 +275,25 @@ def test_ranges_of_extra_dimensions_are_those_of_the_points_that_are_kept(name, 
     assert largest == (49,)
     not_documented = range_of(out, "long steps", "<q")
     assert not_documented == [(0,), (7,), (8,)]
+
+
+@pytest.mark.parametrize("name", ["out.las", "out.laz", "out.copc.laz"])
+def test_ranges_of_extra_dimensions_written_in_parts_are_those_of_all_parts(name, tmp_path):
+    path = tmp_path / "a.las"
+    out = tmp_path / name
+    cloud = full_cloud(6)
+    cloud["Amplitude"].array[:] = np.roll(np.arange(300), 150)
+    cloud.write(path)
+    with_range(path, "Amplitude", "<Q", SMALLEST | LARGEST, (0,), (7,), (8,))
+    table = read(path, 1, 0)
+    whole = TableParts.whole(table)
+    parts = [table.take(np.arange(start, start + 100)) for start in (0, 100, 200)]
+
+    write(out, replace(whole, parts=parts))
+
+    _, smallest, largest = range_of(out, "Amplitude", "<Q")
+    assert smallest == (0,)
+    assert largest == (299,)
 
 
 @pytest.mark.parametrize("form", [4, 10])
