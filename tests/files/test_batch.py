@@ -2,6 +2,8 @@
 
 import os
 
+import numpy as np
+
 from mops_lightning.files import batch
 from tests.support.downsample import call, done
 
@@ -28,6 +30,19 @@ def test_folder_second_run_does_only_missing_files(folder, tmp_path):
     assert "2 files: 1 done, 1 done before" in out
     again = {path.name: path.read_bytes() for path in target.rglob("*.*")}
     assert again == first, "one process gives what two gave"
+
+
+def test_folder_counts_the_points_left_out_of_all_files(tmp_path):
+    source = tmp_path / "in"
+    source.mkdir()
+    for missing in (1, 2, 4):
+        points = np.random.default_rng(missing).random((20, 3))
+        points[:missing] = np.nan
+        np.save(source / f"{missing}.npy", points)
+
+    out = done(source, tmp_path / "out", "--method", "random", "--m", 5)
+
+    assert "3 files: 3 done; 7 points without finite coordinates left out" in out
 
 
 def test_dead_worker_is_reported_and_second_run_completes(folder, tmp_path, monkeypatch):

@@ -1,0 +1,50 @@
+"""Files on which a run was trained are left out of a comparison."""
+
+from pathlib import PurePosixPath
+
+import pytest
+
+from mops_lightning.data.file_splits import split_by_share
+from mops_lightning.files.task_net.held_out import without_training_files
+
+NAMES = [f"scan_{number}.ply" for number in range(10)]
+
+
+@pytest.fixture
+def files(tmp_path):
+    for name in NAMES:
+        (tmp_path / name).touch()
+    return [tmp_path / name for name in NAMES]
+
+
+def dataset(files, **settings):
+    return {"dataset": {"root": str(files[0].parent), "test_share": 0.3, **settings}}
+
+
+@pytest.mark.parametrize("seed", [0, 1, 5])
+def test_kept_files_are_the_test_files_of_the_runs_own_seed(seed, files, capsys):
+    kept = without_training_files(files, [dataset(files, seed=seed)])
+
+    split = split_by_share([PurePosixPath(name) for name in NAMES], 0.3, seed)
+    assert [file.name for file in kept] == [
+        str(file.name) for file in split if file.split == "test"
+    ]
+    assert "7 of 10 files left out" in capsys.readouterr().err
+
+
+def test_kept_files_of_frames_are_those_after_the_training_and_its_gap_too(files):
+    kept = without_training_files(files, [dataset(files, test_frames="last", gap=2, seed=3)])
+
+    assert [file.name for file in kept] == NAMES[5:]
+
+
+def test_files_that_any_run_was_trained_on_are_left_out(files):
+    first = dataset(files, test_share=0.7, seed=0)
+    second = dataset(files, test_share=0.7, seed=1)
+
+    kept = without_training_files(files, [first, second])
+
+    of_first = without_training_files(files, [first])
+    of_second = without_training_files(files, [second])
+    assert kept == [file for file in of_first if file in of_second]
+    assert len(kept) < len(of_first)
