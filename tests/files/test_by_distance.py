@@ -55,6 +55,36 @@ BUDGETS = {
 }
 
 
+def test_mean_of_a_voxel_with_one_point_is_this_point_to_the_last_bit(tmp_path):
+    source = tmp_path / "in.npz"
+    result = tmp_path / "out.npz"
+    random = np.random.default_rng(0)
+    places = np.arange(100.0)[:, None] * [3, 0, 0]
+    points = random.random((100, 3)) + places + [512_345.0, 5_412_345.0, 100.0]
+    np.savez(source, points=points)
+
+    done(source, result, "--voxel", 1, "--readout", "generated")
+
+    alone = read(result, 1, 0).points
+    voxels = np.floor(points)
+    assert len(np.unique(voxels, axis=0)) == 100
+    assert sorted(alone.tolist()) == sorted(points.tolist())
+
+
+def test_spacing_in_many_passes_counts_the_points_of_all_ranges(tmp_path):
+    source = tmp_path / "in.npy"
+    points = np.random.default_rng(0).random((200, 3))
+    points[:20] *= 0.01  # one of these is kept early: the first ranges have no more to offer
+    points[7] = np.nan
+    np.save(source, points)
+
+    out = done(source, tmp_path / "out.npz", "--spacing", 0.15, "--chunk", 10)
+
+    kept = len(read(tmp_path / "out.npz", 1, 0).points)
+    assert kept > 50  # of at most ten that a pass keeps
+    assert f"{kept} of 199 points (1 more without finite coordinates left out)" in out
+
+
 @pytest.mark.parametrize("budget", BUDGETS)
 def test_chunks_and_tiles_equal_one_pass(budget, scan, tmp_path):
     done(scan, tmp_path / "whole.npz", *BUDGETS[budget])
