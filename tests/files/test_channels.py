@@ -98,6 +98,26 @@ def test_generated_points_have_channels_in_the_types_of_the_file(model, table, t
     np.testing.assert_allclose(ring, expected[:, 4], atol=0.51)
 
 
+def test_generated_columns_after_normals_are_their_own(table, tmp_path):
+    model = save(tmp_path / "model.safetensors", *NORMALS, INTENSITY)
+    source = tmp_path / "in.npz"
+    out = tmp_path / "out.npz"
+    normals = np.random.default_rng(1).normal(size=(N, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    names = ("nx", "ny", "nz")
+    table = table.with_columns(dict(zip(names, normals.T, strict=True)))
+    WRITERS[".npz"](source, table)
+
+    done(source, out, "--weights", model, *GENERATED)
+
+    generated = contents(out).columns
+    given = matrix(table, *names, "Intensity")
+    expected, _ = load(model).downsample(given, 9, readout="generated")
+    found = np.stack([generated[name] for name in names], 1)
+    np.testing.assert_allclose(found, expected[:, 3:6], atol=1e-5)
+    np.testing.assert_allclose(generated["Intensity"], expected[:, 6], atol=0.51)
+
+
 def test_generated_points_without_attributes_have_coordinates_only(model, table, tmp_path):
     WRITERS[".npz"](tmp_path / "in.npz", table)
 
