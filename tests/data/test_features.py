@@ -253,7 +253,7 @@ def test_cloud_folder_scaled_as_other_statistics_keeps_the_values(folder):
             r"a net was trained with the features other, intensity, but dataset\.features gives "
             r"intensity\. Set dataset\.features=\[other, intensity\]\.",
         ),
-        (PointChannels(), "trained with the features none, but .* Leave features out"),
+        (PointChannels(), "trained without features, but .* Leave features out"),
     ],
 )
 def test_cloud_folder_scaled_as_other_features_raises(folder, channels, message):

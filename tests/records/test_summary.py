@@ -163,6 +163,21 @@ def test_run_on_own_files_ends_in_the_methods_to_use():
     assert "Use FPS" not in other
 
 
+def test_run_of_a_sampler_that_chooses_input_points_ends_in_the_methods_to_use():
+    of_files = {**NAMES, "task": "icp", "dataset": "clouds"}
+    metrics = {"test/full/median_rotation_error_deg": 1.0}
+    for m, sampled in ((16, 3.0), (32, 2.5)):
+        metrics[f"test/m{m}/sampled/median_rotation_error_deg"] = sampled
+        metrics[f"test/m{m}/fps_farthest/median_rotation_error_deg"] = 4.0
+
+    text = printed(metrics, "test/m32/sampled/median_rotation_error_deg", names=of_files)
+
+    assert (
+        "Use your sampler for 16 to 32 points; your sampler is 25 % better than FPS at 16 and 38 % "
+        "at 32 (one draw).\n"
+    ) in text
+
+
 def test_run_of_registration_without_a_trained_sampler_ends_without_advice():
     of_pairs = {**NAMES, "task": "registration"}
     metrics = {"test/sampled/rotation_error_deg": 9.0, "test/full/rotation_error_deg": 3.0}

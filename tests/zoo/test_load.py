@@ -4,7 +4,16 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from mops_lightning import FMOPSNet, FPSSampler, SampleOutput, Sampler, load
+from mops_lightning import (
+    FMOPSNet,
+    FPSSampler,
+    GumbelSampler,
+    MOPSNet,
+    ProgressiveSampleNet,
+    SampleOutput,
+    Sampler,
+    load,
+)
 from mops_lightning.channels import Channel, PointChannels
 from mops_lightning.config.groups import conf_dir
 from mops_lightning.errors import UserError
@@ -53,6 +62,28 @@ def test_load_of_a_sampler_that_sees_no_channels_takes_them_along(tmp_path):
 
     assert torch.equal(points, cloud[rows])
     assert torch.equal(rows, FPSSampler(4, start="farthest").downsample(cloud)[1])
+
+
+@pytest.mark.parametrize(
+    "saved",
+    [
+        FMOPSNet(16, point_channels=2),
+        MOPSNet(16, point_channels=2),
+        ProgressiveSampleNet(16, point_channels=2),
+        GumbelSampler(16, point_channels=2),
+    ],
+)
+def test_load_gives_a_trained_sampler_its_channels(saved, tmp_path):
+    name = f"{type(saved).__module__}.{type(saved).__qualname__}"
+    size = "m_max" if saved.flexible else "m"
+    config = {"learn": "sampler", "sampler": {"_target_": name, size: 16}}
+    channels = PointChannels([Channel("intensity", 100.0, 50.0), Channel("time")])
+    weights.save(tmp_path / weights.FILE, saved, config, {}, channels=channels)
+
+    sampler = load(tmp_path)
+
+    assert sampler.point_channels == channels
+    assert sampler(torch.rand(1, 40, 5)).points.shape == (1, 16, 5)
 
 
 def test_load_net_gives_the_saved_task_net(tmp_path):

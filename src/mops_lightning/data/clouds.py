@@ -101,14 +101,15 @@ class CloudDataset:
         if channels == self.channels:
             return self
         if channels.names != self.channels.names:
-            wanted = ", ".join(channels.features) or "none"
+            wanted = ", ".join(channels.features)
             found = ", ".join(self.channels.features) or "none"
+            trained = "without features"
             advice = "Leave features out."
             if channels:
+                trained = f"with the features {wanted}"
                 advice = f"Set dataset.features=[{wanted}]."
             raise UserError(
-                f"{source} was trained with the features {wanted}, but dataset.features "
-                f"gives {found}. {advice}"
+                f"{source} was trained {trained}, but dataset.features gives {found}. {advice}"
             )
         train = self._rescaled(self.train, channels)
         test = self._rescaled(self.test, channels)

@@ -15,6 +15,7 @@ from mops_lightning.records.readout_names import (
     COMPLETED,
     FULL,
     GENERATED,
+    INDEX_READOUT,
     MATCHED,
     ROWS,
     parse_metric_name,
@@ -27,6 +28,9 @@ OWN = "own"
 
 DISTINCT = "distinct points"
 """Label of the numbers of distinct points of a sampler that has collapsed."""
+
+JUDGED = (COMPLETED, INDEX_READOUT)
+"""The readouts of input points, of which a sampler has one."""
 
 OF_TEST_CLOUDS = ("test_noise_std", "test_corruption")
 """Settings that change the test clouds; in reports, their values give the columns of a table."""
@@ -60,8 +64,8 @@ def closing_lines(folder: Path, record: RunRecord, console: Console | None = Non
 def advice(record: RunRecord) -> str:
     """Return which method to use for how many points, of runs on own files and of registration.
 
-    The sampler's completed sets are compared with the baselines by the task's score; empty for
-    other runs.
+    The sampler's completed sets, or the input points that it chose, are compared with the baselines
+    by the task's score; empty for other runs.
     """
     names = record.config["names"]
     score = parse_metric_name(record.score_name)
@@ -74,13 +78,14 @@ def advice(record: RunRecord) -> str:
         if name is None or name.metric != score.metric or value is None:
             continue
         is_baseline = name.readout not in ROWS
-        if is_baseline or name.readout == COMPLETED:
+        if is_baseline or name.readout in JUDGED:
             m = name.m or record.config["m"]
             scores[m][name.readout] = [value]
-    if not all(COMPLETED in values for values in scores.values()):
+    own = [readout for readout in JUDGED if all(readout in values for values in scores.values())]
+    if not own:
         return ""
     info = metric_info(score.metric, [record])
-    return verdict(scores, info, [COMPLETED])
+    return verdict(scores, info, own)
 
 
 @dataclass(frozen=True)

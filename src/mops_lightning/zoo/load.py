@@ -92,7 +92,7 @@ def load(path: str | Path, cls: type[Sampler] | None = None) -> Sampler:
             f"{_target(node)!r:.99}. For a sampler of your own, give load() its class: "
             "load(path, cls=MySampler)."
         )
-    if "point_channels" in signature(found).parameters:
+    if _sees_channels(found):
         node = _with_channels(node, content["channels"])
     return _build(found, node, content["state"], path, "sampler", HINT)
 
@@ -139,6 +139,12 @@ def _target(node: Any) -> Any:
     if not isinstance(node, dict):
         return None
     return node.get("_target_")
+
+
+def _sees_channels(cls: type[Sampler]) -> bool:
+    """Return whether a sampler, or a base to which it passes arguments on, takes channels."""
+    bases = [base for base in cls.__mro__ if issubclass(base, Sampler)]
+    return any("point_channels" in signature(base).parameters for base in bases)
 
 
 def _with_channels(node: Any, channels: PointChannels) -> Any:

@@ -43,8 +43,9 @@ def test_grid_has_means_spreads_and_paired_differences():
 
 
 def test_grid_of_one_draw_without_farthest_points_has_no_spread():
-    (grid,) = grids_of(pd.DataFrame([score(0, "random", 2.0)]))
+    (grid,) = grids_of(pd.DataFrame([score(0, "random", 2.0) | {"pairs": 1}]))
 
+    assert grid.title == "plane, 16 points: 1 draw of 1 alignment"
     assert grid.rows[0][:4] == ["random", "16", "2.000", "-"]
 
 

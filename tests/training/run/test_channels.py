@@ -198,7 +198,7 @@ def test_net_without_channels_is_refused(folder):
     line = refused([*SETTINGS, "task=reconstruction", "weights=autoencoder.airplane"], folder)
 
     assert "weights: " in line
-    assert "was trained with the features none, but dataset.features gives intensity" in line
+    assert "was trained without features, but dataset.features gives intensity" in line
 
 
 def test_learned_sampler_without_channels_is_refused():

@@ -8,7 +8,7 @@ from statistics import fmean, stdev
 
 import pandas as pd
 
-from mops_lightning.files.arguments import COMPARED
+from mops_lightning.files.arguments import COMPARED, counted
 from mops_lightning.files.icp.measure import ALIGNED, Score
 from mops_lightning.files.icp.methods import FPS_FARTHEST, TRAINED
 from mops_lightning.filesystem import atomic_write
@@ -101,7 +101,7 @@ def _grid(frame: pd.DataFrame, registration: str, m: int) -> Grid:
         size = f"{m:,} points"
     draws = frame.draw.nunique()
     pairs = frame.pairs.iloc[0]
-    title = f"{registration}, {size}: {draws} draws of {pairs} alignments"
+    title = f"{registration}, {size}: {counted(draws, 'draw')} of {counted(pairs, 'alignment')}"
     rival = frame[frame.method == RIVAL].degrees
     rows = []
     for method in frame.method.unique():
