@@ -208,6 +208,23 @@ def test_run_label_names_net_or_sampler(learn, label):
     assert cfg.logger.name2 == label
 
 
+@pytest.mark.parametrize(
+    ("run", "label"),
+    [
+        ("outputs/noise/fmops-m512", "noise-fmops-m512"),
+        ("../outputs/noise/cell/", "noise-cell"),
+        ("fmops.modelnet40-m512", "fmops.modelnet40-m512"),
+        (None, "fps"),
+    ],
+)
+def test_tested_label_names_the_sweep_and_the_cell_of_the_tested_run(run, label):
+    cfg = compose(["sampler=fps", "+logger.tested=${tested_label:}"])
+
+    cfg.evaluate = run
+
+    assert cfg.logger.tested == label
+
+
 def test_labels_name_own_samplers_by_their_class():
     own = "sampler._target_=mops_lightning.samplers.fps.FPSSampler"
     labels = ["+logger.one=${run_label:}", "+logger.two=${sampler_label:}"]

@@ -27,6 +27,26 @@ from tests.support.training import small_dataset
 DATA = small_dataset(train=4, test=4)
 
 
+@pytest.mark.parametrize("path", ["m", "batch_size", "epochs.task", "pictures"])
+def test_whole_numbers_are_no_truth_values(path):
+    limits = settings.limits(path)
+
+    assert limits is not None
+    assert limits.fits(2)
+    assert not limits.fits(True)
+    assert not limits.fits(2.0)
+
+
+def test_sizes_are_no_truth_values():
+    with pytest.raises(UserError, match=r"sizes must be auto or a list of whole numbers"):
+        check(compose(["sampler=fps", "sizes=[8,true]"]))
+
+
+def test_checkpoint_without_a_training_is_refused():
+    with pytest.raises(UserError, match=r"ckpt_path resumes training; to test a trained run give"):
+        check(compose(["sampler=fps", "learn=nothing", "ckpt_path=last"]))
+
+
 def identity_of(cfg):
     config: Any = OmegaConf.to_container(cfg, resolve=True)
     return checkpoint_identity(config, "data")
