@@ -73,6 +73,19 @@ def test_joint_runs_have_own_task_nets(tmp_path):
         ),
         # The default of an argument that one record sets.
         ({"net": PCRNET}, {"net": {**PCRNET, "iterations": 1}}, "net task.net", []),
+        (
+            {"net": {"sampler": {"start": None}}},
+            {"net": {"sampler": {"start": "farthest"}}},
+            r"start.: .?\b(\w+)",
+            ["null", "farthest"],
+        ),
+        # The size and the seed of the run, which a sampler inside of the net does not use.
+        (
+            {"net": {"sampler": {"m": 32, "seed": 0}}},
+            {"net": {"sampler": {"m": 8, "seed": 1}}},
+            "net task.net",
+            [],
+        ),
     ],
 )
 def test_other_pairs_or_net_settings_have_table_of_their_own(

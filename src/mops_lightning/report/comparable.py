@@ -24,6 +24,10 @@ Key = Callable[[RunRecord], tuple[str, ...] | None]
 IN_ROWS_OF_NETS = ("task.net.", "sampler.")
 """Settings in which the runs of a table of nets may differ."""
 
+OF_RUN = ("m", "seed")
+"""Settings of the run that also stand in a sampler inside of the task net, whose stages have sizes
+of their own."""
+
 
 @dataclass(frozen=True)
 class Group:
@@ -347,10 +351,20 @@ def _trained(record: RunRecord) -> tuple[str, ...] | None:
     """Return what the task nets of a table share; None for a net without weights."""
     if weightless(record):
         return None
-    net = with_defaults(record.config["task"].get("net"))
-    settings = json.dumps(net, sort_keys=True)
+    settings = json.dumps(_settings_of_net(record), sort_keys=True)
     name = collect.names(record)["net"]
     return name, f"task.net={settings}", f"learn={trained_with(record)}"
+
+
+def _settings_of_net(record: RunRecord) -> Any:
+    """Return the settings of a record's task net, without those of the run that are in it."""
+    net = with_defaults(record.config["task"].get("net"))
+    if not isinstance(net, dict) or not isinstance(net.get("sampler"), dict):
+        return net
+    inside = {**net["sampler"]}
+    for name in OF_RUN:
+        inside.pop(name, None)
+    return {**net, "sampler": inside}
 
 
 def _commit(record: RunRecord) -> tuple[str, ...]:
