@@ -45,19 +45,25 @@ def dataset_of(folder, **arguments):
     )
 
 
+def in_order(points):
+    """Return points as sorted tuples of four digits."""
+    return sorted(tuple(row) for row in points.round(decimals=4).tolist())
+
+
 def test_clouds_of_a_folder_keep_all_their_points(folder):
     data = dataset_of(folder)
 
-    assert data.train.sizes is not None
-    assert sorted(data.train.sizes.tolist()) == [40, 60, 90, 120]
-    for path in sorted((folder / "box" / "train").iterdir())[:1]:
-        points = read(path, 0, 0).points
-        expected = UnitSphere.around(points).normalise(points)
-        size = int(data.train.sizes[data.train.labels == 1][0])
-        found = data.train.points[data.train.labels == 1][0, :size]
-        assert len(points) == size
-        order = [tuple(row) for row in expected.round(decimals=4).tolist()]
-        assert sorted(order) == sorted(tuple(row) for row in found.round(decimals=4).tolist())
+    train = data.train
+    assert train.sizes is not None
+    assert sorted(train.sizes.tolist()) == [40, 60, 90, 120]
+    first_box, *_ = sorted((folder / "box" / "train").iterdir())
+    points = read(first_box, 0, 0).points
+    expected = UnitSphere.around(points).normalise(points)
+    is_box = train.labels == 1
+    size = int(train.sizes[is_box][0])
+    found = train.points[is_box][0, :size]
+    assert len(points) == size
+    assert in_order(found) == in_order(expected)
 
 
 def test_loader_without_shuffle_gives_each_cloud_with_all_its_points(folder):
@@ -77,6 +83,7 @@ def test_loader_without_shuffle_gives_each_cloud_with_all_its_points(folder):
 def test_loader_with_shuffle_gives_different_points_of_every_cloud_once(folder):
     clouds = dataset_of(folder).train
     assert clouds.sizes is not None
+    assert clouds.parts is not None
     seen = []
 
     for batch in CloudLoader(clouds, 3, shuffle=True):
@@ -84,23 +91,27 @@ def test_loader_with_shuffle_gives_different_points_of_every_cloud_once(folder):
         assert batch.points.shape[1] == sizes.min()
         for points, parts, row in zip(batch.points, batch.parts, batch.rows, strict=True):
             cloud = clouds.points[row, : clouds.sizes[row]]
-            same = (points[:, None] == cloud).all(2)
-            assert same.sum(1).tolist() == [1] * len(points)
-            assert same.sum(0).max() == 1
-            assert torch.equal(parts, clouds.parts[row][same.int().argmax(1)])
-        seen += batch.rows.tolist()
+            is_same = (points[:, None] == cloud).all(2)
+            assert is_same.sum(1).tolist() == [1] * len(points)
+            assert is_same.sum(0).max() == 1
+            places = is_same.int().argmax(1)
+            assert torch.equal(parts, clouds.parts[row][places])
+        seen.extend(batch.rows.tolist())
 
     assert sorted(seen) == [0, 1, 2, 3]
 
 
 def test_loader_with_shuffle_puts_clouds_of_similar_sizes_together():
     sizes = torch.arange(20, 60)
-    clouds = Clouds(torch.rand(40, 59, 3), torch.zeros(40, dtype=torch.long), sizes=sizes)
+    points = torch.rand(40, 59, 3)
+    clouds = Clouds(points, torch.zeros(40, dtype=torch.long), sizes=sizes)
 
     batches = list(CloudLoader(clouds, 5, shuffle=True))
 
-    spread = [int(sizes[batch.rows].max() - sizes[batch.rows].min()) for batch in batches]
-    assert spread == [4] * 8
+    assert len(batches) == 8
+    for batch in batches:
+        of_batch = sizes[batch.rows]
+        assert of_batch.max() - of_batch.min() == 4
 
 
 def test_loader_points_depend_on_epoch_and_continue_after_a_stop(folder):

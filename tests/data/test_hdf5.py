@@ -27,12 +27,16 @@ def folder(tmp_path):
 
 def test_hdf5_reads_first_points(folder):
     data = hdf5(folder, n_points=20)
+    again = hdf5(folder, n_points=20)
+    other = hdf5(folder, n_points=21)
+
+    with h5py.File(folder / "test.h5") as file:
+        stored = torch.from_numpy(file["data"][:])
     assert data.class_names == ("class_0", "class_1")
     assert data.train.points.shape == (6, 20, 3)
-    with h5py.File(folder / "test.h5") as file:
-        assert torch.equal(data.test.points, torch.from_numpy(file["data"][:, :20]))
-    assert data.fingerprint == hdf5(folder, n_points=20).fingerprint
-    assert data.fingerprint != hdf5(folder, n_points=21).fingerprint
+    assert torch.equal(data.test.points, stored[:, :20])
+    assert data.fingerprint == again.fingerprint
+    assert data.fingerprint != other.fingerprint
 
 
 def test_hdf5_class_names_and_selection(folder):
@@ -45,11 +49,17 @@ def test_hdf5_class_names_and_selection(folder):
         hdf5(folder, 20)
 
 
-@pytest.mark.parametrize(("train", "test"), [([0, 2], [1, 0]), ([1, 0], [0, 2])])
+@pytest.mark.parametrize(
+    ("train", "test"),
+    [
+        ([0, 2], [1, 0]),
+        ([1, 0], [0, 2]),
+    ],
+)
 def test_hdf5_without_names_has_the_classes_of_both_splits(tmp_path, train, test):
-    for split, labels in (("train", train), ("test", test)):
-        points = np.zeros((2, 5, 3), np.float32)
-        write_file(tmp_path / f"{split}.h5", data=points, label=np.array(labels))
+    points = np.zeros((2, 5, 3), np.float32)
+    write_file(tmp_path / "train.h5", data=points, label=np.array(train))
+    write_file(tmp_path / "test.h5", data=points, label=np.array(test))
 
     data = hdf5(tmp_path, n_points=5)
 

@@ -63,24 +63,26 @@ def test_stage_sampler_equals_a_dense_softmax_over_the_host_features(candidates,
     net = moved(StageMOPSNet(5, 7, key_channels=16, candidates=candidates, neighbours=6)).double()
     points = torch.randn(1, 60, 3, dtype=torch.float64, generator=rng)
     features = torch.randn(1, 60, 7, dtype=torch.float64, generator=rng, requires_grad=True)
-    rows = farthest_order(points, 60)[0]
+    (rows,) = farthest_order(points, 60)
     if candidates is not None:
         rows = rows[: candidates * 5]
 
-    output = net.by_features(points, features, 5)
+    (generated,) = net.by_features(points, features, 5).points
 
     expected = plain_stage(net, points[0], features[0], rows, neighbours=6)
-    torch.testing.assert_close(output.points[0], expected)
-    (gradient,) = torch.autograd.grad(output.points.square().sum(), features, retain_graph=True)
-    (expected_gradient,) = torch.autograd.grad(expected.square().sum(), features)
+    torch.testing.assert_close(generated, expected)
+    squares = generated.square().sum()
+    gradient = torch.autograd.grad(squares, features, retain_graph=True)
+    expected_gradient = torch.autograd.grad(expected.square().sum(), features)
     torch.testing.assert_close(gradient, expected_gradient)
 
 
 def test_stage_sampler_loss_is_alpha_times_the_mean_squared_distance(rng):
     net = StageMOPSNet(5, 7, alpha=3.0)
     points = torch.randn(2, 60, 3, generator=rng)
-    output = net.by_features(points, torch.randn(2, 60, 7, generator=rng), 5)
-    squares = torch.tensor([[0.0, 1, 2, 3, 4], [5, 6, 7, 8, 9]])
+    features = torch.randn(2, 60, 7, generator=rng)
+    output = net.by_features(points, features, 5)
+    squares = torch.arange(10.0).view(2, 5)  # with a mean of 4.5
 
     losses = net.losses_in_stage(output, squares)
 
@@ -92,10 +94,11 @@ def test_hierarchical_net_gives_its_stages_the_distances_to_the_nearest_points(r
     net = HierarchicalNet(3, sampler, points=(12,), channels=(8, 10), k=4, hidden=8)
     points = torch.randn(4, 40, 3, generator=rng)
 
-    centres, _ = net.levels(points)[1]
+    _, (centres, _) = net.levels(points)
 
-    squares = torch.cdist(centres, points).amin(2).square()
-    torch.testing.assert_close(net.losses["stage1_subset"], 2.0 * squares.mean())
+    nearest = torch.cdist(centres, points).amin(2)
+    expected = 2.0 * nearest.square().mean()
+    torch.testing.assert_close(net.losses["stage1_subset"], expected)
 
 
 @torch.no_grad()
@@ -148,13 +151,15 @@ def test_stage_sampler_takes_clouds_with_fewer_points(rng):
 
 def test_stage_sampler_starts_near_farthest_points(rng):
     net = StageMOPSNet(50, 4).eval()
-    points = torch.nn.functional.normalize(torch.randn(2, 1000, 3, generator=rng), dim=2)
+    directions = torch.randn(2, 1000, 3, generator=rng)
+    points = torch.nn.functional.normalize(directions, dim=2)
     features = torch.randn(2, 1000, 4, generator=rng)
 
     generated = net.by_features(points, features, 50).points
 
     anchors = gather_points(points, farthest_order(points, 50))
-    assert (generated - anchors).norm(dim=2).max() < 0.2
+    apart = (generated - anchors).norm(dim=2)
+    assert apart.max() < 0.2
 
 
 def test_stage_sampler_outside_a_net_is_refused(rng):

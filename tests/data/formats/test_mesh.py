@@ -29,13 +29,24 @@ def test_parse_formats_give_same_surface(tmp_path, suffix):
 
 
 @pytest.mark.parametrize(
-    "head", ["OFF490 518 0", "OFF 490 518 0", "OFF\r\n490 518 0", "OFF\n# a\n490 518 0"]
+    "head",
+    [
+        "OFF490 518 0",
+        "OFF 490 518 0",
+        "OFF\r\n490 518 0",
+        "OFF\n# a\n490 518 0",
+    ],
 )
 def test_parse_off_header_variants(head):
     ball = trimesh.creation.uv_sphere(count=[16, 32])
-    lines = trimesh.exchange.off.export_off(ball).splitlines()[2:]
-    head = head.replace("490", str(len(ball.vertices))).replace("518", str(len(ball.faces)))
-    mesh = parse_mesh("\n".join([head, *lines]).encode(), Path("m.off"))
+    _, _, *rows = trimesh.exchange.off.export_off(ball).splitlines()
+    vertices = str(len(ball.vertices))
+    faces = str(len(ball.faces))
+    head = head.replace("490", vertices).replace("518", faces)
+    text = "\n".join([head, *rows])
+
+    mesh = parse_mesh(text.encode(), Path("m.off"))
+
     np.testing.assert_allclose(mesh.vertices, ball.vertices, atol=1e-9)
     np.testing.assert_array_equal(mesh.faces, ball.faces)
 
@@ -131,11 +142,25 @@ def test_parse_broken_mesh_raises(name):
         parse_mesh(data, Path(name))
 
 
+FACET = """\
+solid a
+facet normal {normal}
+outer loop
+vertex 0 0 0
+vertex 1 0 0
+vertex 0 1 0
+endloop
+endfacet
+endsolid
+"""
+
+
 @pytest.mark.parametrize("normal", ["nan nan nan", "a b c", "0 1", ""])
 def test_ascii_stl_normals_of_the_file_are_ignored(normal):
-    corners = "".join(f"vertex {corner}\n" for corner in ("0 0 0", "1 0 0", "0 1 0"))
-    facet = f"facet normal {normal}\nouter loop\n{corners}endloop\nendfacet\n"
-    mesh = parse_mesh(f"solid a\n{facet}endsolid\n".encode(), Path("a.stl"))
+    text = FACET.format(normal=normal)
+
+    mesh = parse_mesh(text.encode(), Path("a.stl"))
+
     np.testing.assert_allclose(mesh.face_normals, [[0, 0, 1]])
 
 
@@ -148,14 +173,17 @@ def test_obj_of_many_materials_is_read(tmp_path):
 
 def crafted(path, change):
     """Write a box whose JSON part was changed."""
-    data = trimesh.Scene(trimesh.creation.box()).export(file_type="glb")
-    length = struct.unpack_from("<I", data, 12)[0]
-    tree = json.loads(data[20 : 20 + length])
+    box = trimesh.creation.box()
+    data = trimesh.Scene(box).export(file_type="glb")
+    (length,) = struct.unpack_from("<I", data, 12)
+    end = 20 + length
+    tree = json.loads(data[20:end])
     change(tree)
     text = json.dumps(tree).encode()
     text += b" " * (-len(text) % 4)
-    rest = data[20 + length :]
-    head = b"glTF" + struct.pack("<III", 2, 20 + len(text) + len(rest), len(text)) + b"JSON"
+    rest = data[end:]
+    whole = 20 + len(text) + len(rest)
+    head = b"glTF" + struct.pack("<III", 2, whole, len(text)) + b"JSON"
     path.write_bytes(head + text + rest)
     return path
 
@@ -178,11 +206,19 @@ def test_glb_of_any_size_is_broken(change, tmp_path, monkeypatch):
         sample_mesh(path, path.read_bytes(), 9, 0)
 
 
-def test_glb_texture_of_another_file_is_not_opened_and_buffer_of_one_is_broken(tmp_path):
-    path = crafted(tmp_path / "a.glb", lambda tree: tree.update(images=[{"uri": "/etc/passwd"}]))
-    assert len(parse_mesh(path.read_bytes(), path).faces) == 12
+def test_glb_texture_of_another_file_is_not_opened(tmp_path):
+    texture = {"uri": "/etc/passwd"}
+    path = crafted(tmp_path / "a.glb", lambda tree: tree.update(images=[texture]))
+
+    mesh = parse_mesh(path.read_bytes(), path)
+
+    assert len(mesh.faces) == 12
+
+
+def test_glb_buffer_of_another_file_is_broken(tmp_path):
     (tmp_path / "b.bin").write_bytes(bytes(9))
     other = {"uri": "b.bin", "byteLength": 9}
     path = crafted(tmp_path / "a.glb", lambda tree: tree["buffers"].append(other))
+
     with pytest.raises(BadCloudError, match=r"a\.glb is broken"):
         parse_mesh(path.read_bytes(), path)
