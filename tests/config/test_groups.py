@@ -75,13 +75,13 @@ sampler=fmops: sampler.alpha=30.0 sampler.tau_min=0.1 sampler.m_max=512 optimize
 sampler=fmops recipe=paper: sampler.size_sampling=uniform
 task=registration: sampler.alpha=1.0 sampler.tau_min=0.1 task_lr_scale=0.1
 task=registration: epochs.task=6 epochs.sampler=6
-task=registration sampler=fmops: sampler.alpha=1.0 sampler.tau_min=0.1 sampler.anchors=fps
+task=registration sampler=fmops: sampler.alpha=1.0 sampler.tau_min=0.1 sampler.anchors=framed
 task=registration sampler=fmops: sampler.m_max=64 recipe.train_points=256 recipe.warm_start=True
-task=registration sampler=fmops: sampler.own_frame=True sampler.anchor_width=2.0
+task=registration sampler=fmops: sampler.anchors=framed sampler.anchor_width=2.0
 task=registration sampler=fmops: recipe.feature_distillation=0.0
 task=registration sampler=mops: recipe.feature_distillation=1.0
 task=registration sampler=fmops: weights=auto pretrain_from=pcrnet.modelnet40 optimizer.lr=0.005
-task=registration sampler=fmops recipe=paper: sampler.anchors=None sampler.own_frame=False
+task=registration sampler=fmops recipe=paper: sampler.anchors=None sampler.m_max=64
 task=registration sampler=fmops recipe=paper: optimizer.lr=0.001
 task=reconstruction: sampler.alpha=0.2 sampler.tau_min=0.5
 task=reconstruction sampler=fmops: sampler.alpha=0.2 sampler.tau_min=0.5

@@ -60,7 +60,7 @@ INVALID: list[tuple[type[Sampler], dict[str, Any], str]] = [
     (MOPSNet, {"threshold": 1.0}, "threshold must be at least 0 and below 1, got 1.0"),
     (MOPSNet, {"alpha": -1.0}, "alpha must be at least 0, got -1.0"),
     (MOPSNet, {"alpha": inf}, "alpha must be at least 0, got inf"),
-    (MOPSNet, {"anchors": "voxel"}, "anchors must be fps or null, got 'voxel'"),
+    (MOPSNet, {"anchors": "voxel"}, "anchors must be fps, framed or null, got 'voxel'"),
     *((MOPSNet, {"anchors": "fps", "anchor_width": width}, WIDTH) for width in WIDTHS),
     (MOPSNet, {"anchor_width": 0.3}, "anchor_width has no effect without anchors=fps"),
     (FMOPSNet, {"size_sampling": "nestd"}, "size_sampling: unknown 'nestd'.*nested"),

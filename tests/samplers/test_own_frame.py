@@ -5,19 +5,18 @@ from typing import Any
 import pytest
 import torch
 
-from mops_lightning import FMOPSNet, MOPSNet
+from mops_lightning import FMOPSNet
 from mops_lightning.channels import NO_CHANNELS, Channel, PointChannels
-from mops_lightning.errors import UserError
 from mops_lightning.ops.rigid import quaternion_from_euler, quaternion_to_matrix
 from mops_lightning.samplers.own_frame import in_own_frame, own_axes
 
 LAYERS: dict[str, Any] = {"feature_channels": (8, 6), "rho_channels": (12, 10)}
 
 
-def moved_sampler(own_frame, **settings):
+def moved_sampler(anchors, **settings):
     """A sampler with anchors whose columns depend on its features."""
     torch.manual_seed(0)
-    sampler = FMOPSNet(6, anchors="fps", own_frame=own_frame, tau_min=1.0, **LAYERS, **settings)
+    sampler = FMOPSNet(6, anchors=anchors, tau_min=1.0, **LAYERS, **settings)
     for weights in sampler.queries.parameters():
         torch.nn.init.normal_(weights, std=1.0)
     return sampler.double().eval()
@@ -37,7 +36,7 @@ def turned_pair(rng):
 )
 def test_sample_of_a_turned_cloud_is_the_turned_sample(columns, rng):
     clouds, turned, rotations, shift = turned_pair(rng)
-    sampler = moved_sampler(True, **columns)
+    sampler = moved_sampler("framed", **columns)
 
     sample = sampler(clouds).points
     sample_of_turned = sampler(turned).points
@@ -45,9 +44,9 @@ def test_sample_of_a_turned_cloud_is_the_turned_sample(columns, rng):
     torch.testing.assert_close(sample_of_turned, sample @ rotations.mT + shift)
 
 
-def test_sample_without_own_frame_does_not_turn_with_its_cloud(rng):
+def test_sample_of_plain_anchors_does_not_turn_with_its_cloud(rng):
     clouds, turned, rotations, shift = turned_pair(rng)
-    sampler = moved_sampler(False)
+    sampler = moved_sampler("fps")
 
     apart = sampler(turned).points - (sampler(clouds).points @ rotations.mT + shift)
 
@@ -98,8 +97,3 @@ def test_normals_turn_with_the_cloud(rng):
     described_turned = in_own_frame(torch.cat([turned, normals @ rotations.mT], 2), channels)
 
     torch.testing.assert_close(described, described_turned)
-
-
-def test_own_frame_without_anchors_is_refused():
-    with pytest.raises(UserError, match="own_frame=True needs anchors=fps"):
-        MOPSNet(4, own_frame=True)

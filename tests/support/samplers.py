@@ -53,7 +53,7 @@ SAMPLERS: dict[str, Callable[..., Sampler]] = {
     "fmops": lambda m: FMOPSNet(m, **MOPS_LAYERS),
     "mops-anchors": lambda m: moved(MOPSNet(m, anchors="fps", **MOPS_LAYERS)),
     "fmops-anchors": lambda m: moved(FMOPSNet(m, anchors="fps", **MOPS_LAYERS)),
-    "fmops-own-frame": lambda m: moved(FMOPSNet(m, anchors="fps", own_frame=True, **MOPS_LAYERS)),
+    "fmops-framed": lambda m: moved(FMOPSNet(m, anchors="framed", **MOPS_LAYERS)),
     "mops-local": lambda m: moved(
         MOPSNet(m, anchors="fps", candidates=2, neighbours=3, **MOPS_LAYERS)
     ),

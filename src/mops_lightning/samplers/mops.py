@@ -44,7 +44,9 @@ class MOPSNet(Sampler):
             drops them (paper section "Efficient Regression of the Sampled Set", with 0.01); 0 keeps
             all. Sampling in chunks keeps all.
         anchors: ``fps`` lets the columns of S start as a soft choice of the cloud's farthest points
-            (see ``anchors``); None, as in the paper, lets them start at random.
+            (see ``anchors``); ``framed`` also computes the features from coordinates in a frame
+            that turns with the cloud (see ``own_frame``), so that S is the same for a cloud and its
+            turned copy; None, as in the paper, lets the columns start at random.
         anchor_width: how soft that choice is before training: the width of the columns as a share
             of the spacing of the farthest points. Only with anchors.
         candidates: c, columns choose among the first c·m farthest points of the cloud, whose
@@ -52,9 +54,6 @@ class MOPSNet(Sampler):
             Only with anchors.
         neighbours: k, every column chooses among its k nearest candidates; None, as in the paper,
             for all. Only with anchors.
-        own_frame: True computes features from coordinates in a frame that turns with the cloud (see
-            ``own_frame``), so that S is the same for a cloud and its turned copy; False, as in the
-            paper, from the coordinates as they are. Only with anchors.
         overlap: weight of the penalty on columns of S that choose the same points
             (``losses.subset``); 0, as in the paper, for none.
         point_channels: channels of the points, or their number. Generated points have SᵀF, with
@@ -84,12 +83,11 @@ class MOPSNet(Sampler):
         feature_channels: Sequence[int] = (64, 64, 64, 128, 128),
         rho_channels: Sequence[int] = (512, 256, 128),
         threshold: float = 0.0,
-        anchors: Literal["fps"] | None = None,
+        anchors: Literal["fps", "framed"] | None = None,
         anchor_width: float = DEFAULT_WIDTH,
         overlap: float = 0.0,
         candidates: int | None = None,
         neighbours: int | None = None,
-        own_frame: bool = False,
         point_channels: PointChannels | int = 0,
     ) -> None:
         super().__init__(m)
@@ -99,12 +97,10 @@ class MOPSNet(Sampler):
         check_at_least(0, alpha=alpha, overlap=overlap)
         check_channels("feature_channels", feature_channels)
         check_channels("rho_channels", rho_channels)
-        if anchors not in (None, "fps"):
-            raise UserError(f"anchors must be fps or null, got {anchors!r}.")
+        if anchors not in (None, "fps", "framed"):
+            raise UserError(f"anchors must be fps, framed or null, got {anchors!r}.")
         check_width(anchors, anchor_width)
         check_local(anchors, candidates=candidates, neighbours=neighbours)
-        if own_frame and anchors is None:
-            raise UserError("own_frame=True needs anchors=fps, which turn with the cloud, too.")
         if not 0 <= threshold < 1:
             raise UserError(f"threshold must be at least 0 and below 1, got {threshold}.")
         self.alpha = alpha
@@ -112,7 +108,7 @@ class MOPSNet(Sampler):
         self.threshold = threshold
         self.tau_min = tau_min
         self.training_tau = 1.0
-        self.own_frame = own_frame
+        self.is_framed = anchors == "framed"
         self.streams = anchors is None  # farthest points need all points at once
         self.is_thinned = candidates is not None
         local = feature_channels[-1]
@@ -153,12 +149,12 @@ class MOPSNet(Sampler):
             m = self.m
         places = coordinates(points)
         described = points
-        if self.own_frame:
+        if self.is_framed:
             described = in_own_frame(points, self.point_channels)
         if isinstance(self.queries, LocalAnchors):
 
             def keys_of(candidates: Tensor, rows: Tensor) -> Tensor:
-                if not self.point_channels and not self.own_frame:
+                if not self.point_channels and not self.is_framed:
                     return self._keys(candidates)
                 return self._keys(gather_points(described, rows))
 
