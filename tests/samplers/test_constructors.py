@@ -30,8 +30,8 @@ from mops_lightning.zoo.load import package_samplers
 FILES = [
     path for path in sorted(conf_dir().joinpath("sampler").glob("*.yaml")) if path.stem != "own"
 ]
-OTHERS = {"net", "size_sampling", "coverage", "coverage_per_point", "point_channels"}
-"""Arguments of which some sampler's file sets another value than the default, or the data do."""
+OTHERS = {"net", "size_sampling", "coverage", "coverage_per_point", "point_channels", "channels"}
+"""Arguments whose default differs from a sampler's file, or that the data or the host net set."""
 LIMITS: list[tuple[type[Sampler], dict[str, Any]]] = [
     (FPSSampler, {"start": 0}),
     (FPSSampler, {"start": 59}),
