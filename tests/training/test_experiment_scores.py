@@ -146,6 +146,8 @@ def twins_of(sampler):
     """The readouts and baselines whose points may equal those of another."""
     if isinstance(getattr(sampler, "queries", None), LocalAnchors):
         return ("matched", "completed")  # columns of three entries stay next to their anchors
+    if getattr(sampler, "is_framed", False):
+        return ("matched", "completed")  # of these clouds, columns choose their anchors
     twins: dict[type, tuple[str, ...]] = {
         FPSSampler: ("fps",),
         RandomSampler: ("random",),

@@ -118,7 +118,7 @@ def _several_nearest(queries: Tensor, points: Tensor, k: int) -> Tensor | None:
     dtype = distance_dtype(points)
     many = points.detach().to(dtype).contiguous().view(clouds, -1).numpy()
     few = queries.detach().to(dtype).contiguous().view(clouds, -1).numpy()
-    rows = torch.empty(clouds, m, k, dtype=torch.int64)
+    rows = torch.empty(clouds, m, k, dtype=torch.int64, device="cpu")
     out = rows.view(clouds, -1).numpy()
 
     def search(part: slice) -> bool:
@@ -149,7 +149,7 @@ def winners(features: Tensor, rows: Tensor) -> Tensor | None:
     if features.dtype.itemsize < 4:
         return None
     clouds, m, _ = rows.shape
-    largest = torch.empty(clouds, m, features.shape[2], dtype=torch.int64)
+    largest = torch.empty(clouds, m, features.shape[2], dtype=torch.int64, device="cpu")
     arrays = [part.detach().contiguous().numpy() for part in (features, rows, largest)]
 
     def search(part: slice) -> None:
