@@ -208,6 +208,12 @@ class Sampler(nn.Module):
         chunks = partial(iter, [cloud])
         return stream_sample(self, chunks, m)
 
+    def seen_of(self, points: Tensor) -> Tensor:
+        """Return the columns of ``(B, N, 3 + C)`` points that ``sample`` sees."""
+        if self.point_channels:
+            return points
+        return coordinates(points)
+
     def _checked(self, points: Tensor, m: int) -> SampleOutput:
         """Check the points and sample them, without losses."""
         # A graph cannot branch on values, and on a GPU the check waits for the device.
@@ -217,9 +223,7 @@ class Sampler(nn.Module):
         dtype = next((weights.dtype for weights in self.parameters()), points.dtype)
         if not torch.is_autocast_enabled(points.device.type):
             check_dtype(points, dtype)
-        seen = points
-        if not self.point_channels:
-            seen = coordinates(points)
+        seen = self.seen_of(points)
         with restrict_autocast_to_pointwise(points.device.type):
             sampled = self.sample(seen.to(dtype), m)
             output = with_carried(sampled, points)

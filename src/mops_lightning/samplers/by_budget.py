@@ -7,7 +7,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from mops_lightning.channels import PointChannels, coordinates
+from mops_lightning.channels import PointChannels
 from mops_lightning.errors import UserError
 from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.base import Sampler
@@ -93,10 +93,7 @@ class ByBudget(Sampler):
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Return m of the points ``(B, N, 3)`` with their indices."""
         sampler = self.sampler_for(m)
-        seen = points
-        if not sampler.point_channels:
-            seen = coordinates(points)
-        rows = rows_in_unit_sphere(sampler, seen, m)
+        rows = rows_in_unit_sphere(sampler, sampler.seen_of(points), m)
         return SampleOutput(gather_points(points, rows), rows, {})
 
 

@@ -154,7 +154,7 @@ class MOPSNet(Sampler):
         if isinstance(self.queries, LocalAnchors):
 
             def keys_of(candidates: Tensor, rows: Tensor) -> Tensor:
-                if not self.point_channels and not self.is_framed:
+                if described is places:  # the candidates are gathered already
                     return self._keys(candidates)
                 return self._keys(gather_points(described, rows))
 

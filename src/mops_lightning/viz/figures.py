@@ -86,6 +86,15 @@ def cloud_axes(
     return axes
 
 
+def at_edges(row: int, column: int, title: str, label: str) -> tuple[str, str]:
+    """Return the title for the first row only, and the label for the first column only."""
+    if row > 0:
+        title = ""
+    if column > 0:
+        label = ""
+    return title, label
+
+
 def save_figure(figure: Figure, path: Path, dpi: float = 110, software: str = "") -> Path:
     """Write a figure as PNG or SVG, completely or not at all.
 
@@ -151,12 +160,7 @@ def cloud_grid(
     figure = new_figure(inches * len(columns), inches * number, "tight")
     for row, cloud in enumerate(upright(coordinates(points))):
         for column, (name, samples) in enumerate(columns.items()):
-            title = ""
-            if row == 0:
-                title = name
-            label = ""
-            if column == 0:
-                label = titles[row]
+            title, label = at_edges(row, column, name, titles[row])
             axes = cloud_axes(figure, number, len(columns), row, column, title, label)
             drawn = None
             if samples is not None:

@@ -11,6 +11,7 @@ from mpl_toolkits.mplot3d.axes3d import Axes3D
 from torch import Tensor
 
 from mops_lightning.viz.figures import (
+    at_edges,
     cloud_axes,
     draw_cloud,
     frame_cloud,
@@ -186,12 +187,7 @@ def part_grid(points: Tensor, parts: Mapping[str, Tensor], titles: Sequence[str]
     }
     for row, cloud in enumerate(map(thinned, upright(points))):
         for column, (name, numbers) in enumerate(parts.items()):
-            title = ""
-            if row == 0:
-                title = name
-            label = ""
-            if column == 0:
-                label = titles[row]
+            title, label = at_edges(row, column, name, titles[row])
             axes = grid.axes(row, column, title, label)
             of_points = numbers[row].cpu()[:, None]
             drawn = thinned(of_points)[:, 0]
