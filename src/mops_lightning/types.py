@@ -72,6 +72,8 @@ class SampleOutput(NamedTuple):
             ``points``, or None; only in training. See ``Sampler.project`` for the readout.
         log_residuals: ``(B, N)`` logarithms of the residuals that the sampler expects at the input
             points in registration, or None.
+        neighbours: ``(B, M, k)`` int64 rows of the input points around every sampled point,
+            nearest first, or None where the sampler has not searched for them.
 
     Examples:
         >>> import torch
@@ -87,6 +89,7 @@ class SampleOutput(NamedTuple):
     matrix: "SamplingMatrix | LocalMatrix | None" = None
     soft_projected: Tensor | None = None
     log_residuals: Tensor | None = None
+    neighbours: Tensor | None = None
 
     def first(self, m: int) -> "SampleOutput":
         """Return the first ``m`` points, without the losses, which cover all points."""
@@ -99,6 +102,7 @@ class SampleOutput(NamedTuple):
             None if self.matrix is None else self.matrix.leftmost(m),
             None if self.soft_projected is None else self.soft_projected[:, :m],
             self.log_residuals,
+            None if self.neighbours is None else self.neighbours[:, :m],
         )
 
 

@@ -22,6 +22,21 @@ def test_neighbourhood_moments_equal_those_of_gathered_offsets_and_so_do_their_g
     )
 
 
+def test_neighbourhood_moments_of_fixed_points_have_the_same_gradients_of_centres(rng):
+    points = torch.randn(2, 9, 3, generator=rng)
+    centres = torch.randn(2, 5, 3, generator=rng, requires_grad=True)
+    rows = torch.randint(9, (2, 5, 4), generator=rng)
+    given = torch.randn(2, 5, 12, generator=rng)
+    moved = points.clone().requires_grad_()
+    moments = neighbourhood_moments(moved, centres, rows)
+    expected, _ = torch.autograd.grad(moments, (centres, moved), given)
+
+    moments = neighbourhood_moments(points, centres, rows)
+
+    (gradient,) = torch.autograd.grad(moments, centres, given)
+    assert gradient.equal(expected)
+
+
 def test_neighbourhood_moments_of_half_precision_are_near_those_in_single(rng):
     points = torch.randn(2, 9, 3, generator=rng)
     rows = torch.randint(9, (2, 5, 4), generator=rng)

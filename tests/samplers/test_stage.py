@@ -7,7 +7,7 @@ import torch
 
 from mops_lightning import StageMOPSNet
 from mops_lightning.errors import UserError
-from mops_lightning.nets.hierarchical import HierarchicalNet
+from mops_lightning.nets.hierarchical import HierarchicalNet, Stage
 from mops_lightning.ops.fps import farthest_point_sample
 from mops_lightning.ops.points import gather_points
 
@@ -42,7 +42,7 @@ def plain_stage(net, points, features, candidates, neighbours):
 
     local = features[candidates]
     hidden = net.rho_local(local) + net.rho_global(local.amax(0))
-    keys = net.rho_first(hidden)
+    keys = hidden.relu()
     queries = net.queries.slots + keys[:5] @ net.queries.relation.T / 4
     logits = keys @ queries.T
 
@@ -101,19 +101,41 @@ def test_hierarchical_net_gives_its_stages_the_distances_to_the_nearest_points(r
     torch.testing.assert_close(net.losses["stage1_subset"], expected)
 
 
-@torch.no_grad()
-def test_stage_sampler_keys_without_gradients_equal_those_with_gradients(rng):
-    net = StageMOPSNet(5, 7).double()
-    local = torch.randn(2, 60, 7, dtype=torch.float64, generator=rng)
-    for weights in net.rho_first.parameters():
-        torch.nn.init.normal_(weights)
-    net._keys_from(local)  # running statistics
-    net.eval()
+@pytest.mark.parametrize("k", [3, 6])
+def test_stage_gathers_the_points_nearest_to_the_anchors(k, rng):
+    net = moved(StageMOPSNet(5, 7, tau_min=1.0, anchor_width=3.0, neighbours=6)).eval()
+    stage = Stage(net, 5, channels_in=7, channels_out=9, k=k).eval()
+    points = torch.randn(2, 60, 3, generator=rng)
+    features = torch.randn(2, 60, 7, generator=rng)
 
-    keys = net._keys_from(local)
+    centres, _ = stage(points, features)
+    rows = stage._neighbours(net.by_features(points, features, 5), points)
 
-    with torch.enable_grad():
-        torch.testing.assert_close(keys, net._keys_from(local).detach())
+    anchors = gather_points(points, farthest_order(points, 5))
+    assert not torch.equal(centres, anchors)
+    expected = torch.cdist(anchors, points).argsort(2)[..., :k]
+    assert rows.equal(expected)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"neighbours": 3},  # fewer than the stage gathers
+        {"neighbours": 6, "candidates": 2},  # not among all points
+        {"neighbours": None},
+    ],
+)
+def test_stage_searches_neighbours_that_its_sampler_does_not_know(settings, rng):
+    net = moved(StageMOPSNet(5, 7, tau_min=1.0, anchor_width=3.0, **settings)).eval()
+    stage = Stage(net, 5, channels_in=7, channels_out=9, k=4).eval()
+    points = torch.randn(2, 60, 3, generator=rng)
+    features = torch.randn(2, 60, 7, generator=rng)
+    output = net.by_features(points, features, 5)
+
+    rows = stage._neighbours(output, points)
+
+    expected = torch.cdist(output.points, points).argsort(2)[..., :4]
+    assert rows.equal(expected)
 
 
 def test_hierarchical_net_trains_its_stages_through_the_host_features(rng):

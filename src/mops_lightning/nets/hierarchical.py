@@ -54,7 +54,8 @@ class Stage(nn.Module):
     ‖p_j − q_i‖ of a cloud, so that offsets are of one size in all stages; PointNeXt (Qian et al.,
     NeurIPS 2022) divides them by a fixed radius. s_i, the means of o_ij and of the products of its
     coordinates, describes the plane of the neighbourhood. As A and B are linear, only A·f_j +
-    B·p_j/r depends on j, so that no tensor of all edges' features is made.
+    B·p_j/r depends on j, so that no tensor of all edges' features is made. A sampler may name the
+    neighbourhoods itself (``SampleOutput.neighbours``), which saves the search for them.
 
     Args:
         sampler: returns the centres.
@@ -102,10 +103,11 @@ class Stage(nn.Module):
             )
         output = self._sampled(points, features)
         centres = output.points
-        rows = k_nearest_rows(centres, points, min(self.k, n))
+        rows = self._neighbours(output, points)
         self.losses = output.losses
         if self.training and isinstance(self.sampler, LossInStage):
-            squares = (centres - gather_points(points, rows[..., 0])).square().sum(2)
+            _, nearest_row = nearest(centres, points)
+            squares = (centres - gather_points(points, nearest_row)).square().sum(2)
             self.losses = self.sampler.losses_in_stage(output, squares)
         offset_moments = neighbourhood_moments(points, centres, rows)
         r = root_mean_square(offset_moments)
@@ -117,6 +119,13 @@ class Stage(nn.Module):
         activated = F.relu(self.norm(edges.flatten(0, 1)))
         mixed = activated.unflatten(0, centres.shape[:2])
         return centres, mixed + self.mlp(mixed).to(mixed)
+
+    def _neighbours(self, output: SampleOutput, points: Tensor) -> Tensor:
+        """Return the rows ``(B, M, k)`` of the neighbourhoods of sampled points."""
+        k = min(self.k, points.shape[1])
+        if output.neighbours is not None and output.neighbours.shape[2] >= k:
+            return output.neighbours[..., :k]
+        return k_nearest_rows(output.points, points, k)
 
     def _sampled(self, points: Tensor, features: Tensor) -> SampleOutput:
         sizes = (self.m,)

@@ -72,10 +72,14 @@ def columns_backward(
     point_gradients,
     sharpness_gradients,
 ):
-    """Add the gradients of ``columns`` to the gradients of its arguments."""
+    """Add the gradients of ``columns`` to the gradients of its arguments.
+
+    Those of the points are left out where their array is empty.
+    """
     clouds, m, k = weights.shape
     rate = weights.dtype.type(1 / tau)
     given = np.empty(k, weights.dtype)  # the gradients of the logits of a column
+    are_points_fixed = point_gradients.size == 0
     for cloud in range(clouds):
         for j in range(m):
             mean = weights.dtype.type(0)
@@ -105,15 +109,19 @@ def columns_backward(
                 x = points[cloud, place, 0] - ax
                 y = points[cloud, place, 1] - ay
                 z = points[cloud, place, 2] - az
+                total += given[t] * (x * x + y * y + z * z)
+                if are_points_fixed:
+                    continue
                 point_gradients[cloud, place, 0] += share * x
                 point_gradients[cloud, place, 1] += share * y
                 point_gradients[cloud, place, 2] += share * z
                 gx, gy, gz = gx + share * x, gy + share * y, gz + share * z
-                total += given[t] * (x * x + y * y + z * z)
+            sharpness_gradients[cloud, j] -= total
+            if are_points_fixed:
+                continue
             point_gradients[cloud, anchor, 0] -= gx
             point_gradients[cloud, anchor, 1] -= gy
             point_gradients[cloud, anchor, 2] -= gz
-            sharpness_gradients[cloud, j] -= total
 
 
 @jit_sums
@@ -142,17 +150,24 @@ def sums(weights, rows, values, out):
 
 @jit_sums
 def sums_backward(gradients, weights, rows, values, weight_gradients, value_gradients):
-    """Add the gradients of ``sums`` to those of values, and write those of weights."""
+    """Add the gradients of ``sums`` to those of values, and write those of weights.
+
+    Those of the values are left out where their array is empty.
+    """
     clouds, m, k = weights.shape
+    are_values_fixed = value_gradients.size == 0
     for cloud in range(clouds):
         for j in range(m):
             gradient = gradients[cloud, j]
             for t in range(k):
                 weight = weights[cloud, j, t]
                 line = values[cloud, rows[cloud, j, t]]
-                line_gradient = value_gradients[cloud, rows[cloud, j, t]]
                 product = weights.dtype.type(0)
                 for c in range(len(gradient)):
                     product += gradient[c] * line[c]
-                    line_gradient[c] += weight * gradient[c]
                 weight_gradients[cloud, j, t] = product
+                if are_values_fixed:
+                    continue
+                line_gradient = value_gradients[cloud, rows[cloud, j, t]]
+                for c in range(len(gradient)):
+                    line_gradient[c] += weight * gradient[c]

@@ -34,8 +34,12 @@ def moments(points, centres, rows, out):
 
 @jit_cached
 def moments_backward(gradients, points, centres, rows, point_gradients, centre_gradients):
-    """Add the gradients of ``moments`` to the gradients of points and centres."""
+    """Write the gradients of centres from those of ``moments``, and add to those of points.
+
+    Those of the points are left out where their array is empty.
+    """
     clouds, m, k = rows.shape
+    are_points_fixed = point_gradients.size == 0
     number = points.dtype.type(k)
     for cloud in range(clouds):
         for i in range(m):
@@ -46,6 +50,7 @@ def moments_backward(gradients, points, centres, rows, point_gradients, centre_g
             xz = (given[5] + given[9]) / number
             yz = (given[8] + given[10]) / number
             cx, cy, cz = centres[cloud, i, 0], centres[cloud, i, 1], centres[cloud, i, 2]
+            sx = sy = sz = points.dtype.type(0)
             for t in range(k):
                 row = rows[cloud, i, t]
                 x, y, z = points[cloud, row, 0], points[cloud, row, 1], points[cloud, row, 2]
@@ -53,9 +58,12 @@ def moments_backward(gradients, points, centres, rows, point_gradients, centre_g
                 dx = gx + xx * x + xy * y + xz * z
                 dy = gy + xy * x + yy * y + yz * z
                 dz = gz + xz * x + yz * y + zz * z
+                sx, sy, sz = sx + dx, sy + dy, sz + dz
+                if are_points_fixed:
+                    continue
                 point_gradients[cloud, row, 0] += dx
                 point_gradients[cloud, row, 1] += dy
                 point_gradients[cloud, row, 2] += dz
-                centre_gradients[cloud, i, 0] -= dx
-                centre_gradients[cloud, i, 1] -= dy
-                centre_gradients[cloud, i, 2] -= dz
+            centre_gradients[cloud, i, 0] = -sx
+            centre_gradients[cloud, i, 1] = -sy
+            centre_gradients[cloud, i, 2] = -sz

@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from mops_lightning.ops import kernel_local
 from mops_lightning.ops.nearest import k_nearest_rows
-from mops_lightning.ops.points import gather_points
+from mops_lightning.ops.points import gather_points, zeros_if
 
 TREE_MIN_WORK = 2**22
 """Number of distances in a cloud from which a tree finds neighbours faster than all distances."""
@@ -91,13 +91,15 @@ class _WeightedSums(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, Tensor]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, Tensor | None]:
         weights, rows, values = ctx.saved_tensors
         weight_gradients = torch.empty_like(weights)
-        value_gradients = torch.zeros_like(values)
+        value_gradients = zeros_if(ctx.needs_input_grad[2], values)
         given = gradients[0].contiguous()
         parts = (given, weights, rows, values, weight_gradients, value_gradients)
         kernel_local.sums_backward(*_arrays(*parts))
+        if not ctx.needs_input_grad[2]:
+            return weight_gradients, None, None
         return weight_gradients, None, value_gradients
 
 
@@ -124,12 +126,18 @@ class _ColumnWeights(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         weights, *inputs = ctx.saved_tensors
-        floats = inputs[:4]
-        written = [torch.zeros_like(part) for part in floats]
+        queries, keys, points, sharpness, _, _ = inputs
+        are_points_needed = ctx.needs_input_grad[2]
+        query_gradients = torch.zeros_like(queries)
+        key_gradients = torch.zeros_like(keys)
+        point_gradients = zeros_if(are_points_needed, points)
+        sharpness_gradients = torch.zeros_like(sharpness)
+        written = (query_gradients, key_gradients, point_gradients, sharpness_gradients)
         kernel_local.columns_backward(
             *_arrays(gradients[0].contiguous(), weights, *inputs), ctx.tau, *_arrays(*written)
         )
-        return (*written, None, None, None)
+        of_points = point_gradients if are_points_needed else None
+        return query_gradients, key_gradients, of_points, sharpness_gradients, None, None, None
 
 
 def _arrays(*parts: Tensor) -> list[NDArray[Any]]:

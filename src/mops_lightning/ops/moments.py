@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mops_lightning.ops import kernel_moments
-from mops_lightning.ops.points import gather_points
+from mops_lightning.ops.points import gather_points, zeros_if
 
 
 def neighbourhood_moments(points: Tensor, centres: Tensor, rows: Tensor) -> Tensor:
@@ -44,11 +44,13 @@ class _Moments(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor, None]:
         points, centres, rows = ctx.saved_tensors
-        point_gradients = torch.zeros_like(points)
-        centre_gradients = torch.zeros_like(centres)
+        point_gradients = zeros_if(ctx.needs_input_grad[0], points)
+        centre_gradients = torch.empty_like(centres)
         given = gradients[0].contiguous()
         parts = (given, points, centres, rows, point_gradients, centre_gradients)
         kernel_moments.moments_backward(*(part.detach().numpy() for part in parts))
+        if not ctx.needs_input_grad[0]:
+            return None, centre_gradients, None
         return point_gradients, centre_gradients, None

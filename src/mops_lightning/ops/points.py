@@ -130,3 +130,10 @@ def distance_dtype(points: Tensor) -> torch.dtype:
 def to_planes(points: Tensor) -> Tensor:
     """Convert ``(B, N, C)`` to contiguous ``(C, B, N)``, one plane per coordinate."""
     return points.permute(2, 0, 1).contiguous()
+
+
+def zeros_if(is_needed: bool, like: Tensor) -> Tensor:
+    """Return zeros of a tensor's shape for gradients that are needed, otherwise no values."""
+    if is_needed:
+        return torch.zeros_like(like)
+    return like.new_empty([0] * like.ndim)

@@ -30,22 +30,29 @@ from mops_lightning.samplers.anchors import (
     squared_spacing,
 )
 
-Keys = Callable[[Tensor, Tensor], Tensor]
-"""From candidates ``(B, K, 3)`` and their rows ``(B, K)`` in the cloud to keys ``(B, K, C)``."""
-
 
 class Thinned(NamedTuple):
     """The candidates of clouds.
 
     Attributes:
-        rows: ``(B, K)`` int64, the candidates' rows in the cloud.
+        rows: ``(B, K)`` int64, the candidates' rows in the cloud; None: all points, in their order.
         anchors: ``(B, m)`` int64, the places of the anchors among the candidates.
         unit: ``(B,)``, the squared unit of widths.
     """
 
-    rows: Tensor
+    rows: Tensor | None
     anchors: Tensor
     unit: Tensor
+
+    def of(self, values: Tensor) -> Tensor:
+        """Return the values ``(B, K, V)`` of the candidates, from those of all points."""
+        if self.rows is None:
+            return values
+        return gather_points(values, self.rows)
+
+
+Keys = Callable[[Thinned], Tensor]
+"""From the candidates of clouds to their keys ``(B, K, C)``."""
 
 
 class LocalAnchors(FPSAnchors):
@@ -91,9 +98,8 @@ class LocalAnchors(FPSAnchors):
         """
         places = points.to(distance_dtype(points))
         thinned = self.thin(places, m)
-        candidates = gather_points(places, thinned.rows)
-        keys = keys_of(gather_points(points, thinned.rows), thinned.rows)
-        keys = keys.to(places.dtype)
+        candidates = thinned.of(places)
+        keys = keys_of(thinned).to(places.dtype)
         anchors = gather_points(candidates, thinned.anchors)
         content = self._content(gather_points(keys, thinned.anchors), m)
         sharpness = self._sharpness(thinned.unit, m)
@@ -102,18 +108,21 @@ class LocalAnchors(FPSAnchors):
             squares = apart.square().sum(3)
             logits = content @ keys.mT - sharpness[..., None] * squares
             weights = (logits / tau).softmax(2)
-            rows = thinned.rows[:, None].expand_as(weights)
-            return LocalMatrix(weights, rows, points.shape[1])
-        k = min(self.neighbours, candidates.shape[1])
-        near = nearest_rows(anchors, candidates, k)
-        entries = Entries(candidates, thinned.anchors, near)
-        weights = column_weights(content, keys, entries, sharpness, tau)
-        rows = thinned.rows.gather(1, near.flatten(1)).view_as(near)
+            all_places = torch.arange(candidates.shape[1], device=points.device)
+            near = all_places.expand_as(weights)
+        else:
+            k = min(self.neighbours, candidates.shape[1])
+            near = nearest_rows(anchors, candidates, k)
+            entries = Entries(candidates, thinned.anchors, near)
+            weights = column_weights(content, keys, entries, sharpness, tau)
+        rows = near
+        if thinned.rows is not None:
+            rows = thinned.rows.gather(1, near.flatten(1)).view_as(near)
         return LocalMatrix(weights, rows, points.shape[1])
 
     def thin(self, places: Tensor, m: int) -> Thinned:
         """Choose the candidates of clouds ``(B, N, 3)``, and m anchors among them."""
-        clouds, n = places.shape[:2]
+        clouds, n, _ = places.shape
         wanted = self._wanted(n)
         farthest = rows_from_mean(places, m if wanted is None else wanted)
         first_places = gather_points(places, farthest[:, :SPACING_POINTS])
@@ -122,9 +131,7 @@ class LocalAnchors(FPSAnchors):
             first_rows = torch.arange(m, device=places.device)
             anchors = first_rows.expand(clouds, m)
             return Thinned(farthest[:, :wanted], anchors, unit)
-        all_rows = torch.arange(n, device=places.device)
-        everything = all_rows.expand(clouds, n)
-        return Thinned(everything, farthest[:, :m], unit)
+        return Thinned(None, farthest[:, :m], unit)
 
     def _wanted(self, n: int) -> int | None:
         """Return how many of n points are candidates; None: all, in the order of the cloud."""

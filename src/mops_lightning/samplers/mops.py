@@ -11,13 +11,12 @@ from mops_lightning.errors import UserError, check_at_least
 from mops_lightning.losses.subset import overlap_losses, subset_losses
 from mops_lightning.nets.layers import PointFeatures, PointMLP, check_channels, linear_norm_relu
 from mops_lightning.ops.local_matrix import LocalMatrix
-from mops_lightning.ops.points import gather_points
 from mops_lightning.ops.precision import pointwise_autocast, pointwise_autocast_dtype
 from mops_lightning.ops.sampling_matrix import SamplingMatrix
 from mops_lightning.samplers.anchors import FPSAnchors
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.fused import FusedMOPSNet, fused_layer, fused_layers
-from mops_lightning.samplers.local import LocalAnchors
+from mops_lightning.samplers.local import LocalAnchors, Thinned
 from mops_lightning.samplers.own_frame import in_own_frame
 from mops_lightning.types import SampleOutput
 
@@ -153,10 +152,8 @@ class MOPSNet(Sampler):
             described = in_own_frame(points, self.point_channels)
         if isinstance(self.queries, LocalAnchors):
 
-            def keys_of(candidates: Tensor, rows: Tensor) -> Tensor:
-                if described is places:  # the candidates are gathered already
-                    return self._keys(candidates)
-                return self._keys(gather_points(described, rows))
+            def keys_of(thinned: Thinned) -> Tensor:
+                return self._keys(thinned.of(described))
 
             return self.queries.local_matrix(places, keys_of, m, self.tau)
         keys = self._keys(described)

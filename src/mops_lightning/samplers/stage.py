@@ -1,19 +1,16 @@
 """MOPS-Net inside a hierarchical net, on the features that the net has at a stage."""
 
-import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from mops_lightning.errors import UserError
 from mops_lightning.losses.subset import overlap_losses
-from mops_lightning.ops.points import gather_points
+from mops_lightning.ops.maxima import max_of_points
 from mops_lightning.ops.precision import (
     pointwise_autocast,
-    pointwise_autocast_dtype,
     restrict_autocast_to_pointwise,
 )
-from mops_lightning.samplers.fused import fused_layer
-from mops_lightning.samplers.local import LocalAnchors
+from mops_lightning.samplers.local import LocalAnchors, Thinned
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.types import SampleOutput
 
@@ -28,8 +25,10 @@ class StageMOPSNet(MOPSNet):
 
     A stage of a hierarchical net knows features of its points. This sampler reads them instead of
     computing features of its own from coordinates: one layer of ρ maps the local feature and the
-    maximum over the candidates to keys. It works inside such a net only, where it maps
-    ``(B, N, 3)`` points to ``(B, m, 3)``.
+    maximum over the candidates to keys. The points that a column chooses among, those nearest to
+    its anchor, are also the neighbourhood whose features the stage gathers, so that one search
+    serves both. It works inside such a net only, where it maps ``(B, N, 3)`` points to
+    ``(B, m, 3)``.
 
     Args:
         m: largest number of points; of a cloud with fewer points, all are returned.
@@ -55,6 +54,7 @@ class StageMOPSNet(MOPSNet):
 
     flexible = True
     nested = True
+    queries: LocalAnchors
 
     def __init__(
         self,
@@ -82,7 +82,11 @@ class StageMOPSNet(MOPSNet):
             candidates=candidates,
             neighbours=neighbours,
         )
-        del self.features  # the host has features
+        # Also where a column chooses among all points: with keys that are given.
+        self.queries = LocalAnchors(m, key_channels, anchor_width, candidates, neighbours)
+        # The host has features, and their scale is known: its layers end in BatchNorm and ReLU.
+        del self.features, self.rho_first
+        self.rho_local = nn.Linear(channels, key_channels)
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Refuse points without features."""
@@ -91,18 +95,17 @@ class StageMOPSNet(MOPSNet):
     def by_features(self, points: Tensor, features: Tensor, m: int) -> SampleOutput:
         """Generate m of the points ``(B, N, 3)`` with features ``(B, N, channels)``; no losses."""
 
-        def keys_of(candidates: Tensor, rows: Tensor) -> Tensor:
-            chosen = features
-            if rows.shape[1] < features.shape[1]:
-                chosen = gather_points(features, rows)
-            return self._keys_from(chosen)
+        def keys_of(thinned: Thinned) -> Tensor:
+            return self._keys_from(thinned.of(features))
 
-        assert isinstance(self.queries, LocalAnchors)
         with restrict_autocast_to_pointwise(points.device.type):
             matrix = self.queries.local_matrix(points, keys_of, m, self.tau)
             sampled = matrix.sample(points.to(matrix.dtype))
             sampled = sampled.to(points.dtype)
-        return SampleOutput(sampled, None, {}, matrix)
+        neighbours = None
+        if not self.is_thinned and self.queries.neighbours is not None:
+            neighbours = matrix.rows
+        return SampleOutput(sampled, None, {}, matrix, neighbours=neighbours)
 
     def losses_in_stage(self, output: SampleOutput, squares: Tensor) -> dict[str, Tensor]:
         """Return the weighted losses of points from ``by_features``.
@@ -120,22 +123,8 @@ class StageMOPSNet(MOPSNet):
 
     def _keys_from(self, local: Tensor) -> Tensor:
         """Return keys ``(B, K, C)`` of the candidates' features ``(B, K, channels)``."""
-        is_plain = self.training or torch.is_grad_enabled() or torch.compiler.is_compiling()
-        if not is_plain and pointwise_autocast_dtype() is None:
-            return self._keys_without_gradients(local)
         with pointwise_autocast(local.device.type):
-            of_cloud = self.rho_global(local.amax(1))
+            of_cloud = self.rho_global(max_of_points(local))
             hidden = self.rho_local(local).add_(of_cloud[:, None])
-            rows = self.rho_first(hidden.flatten(0, 1))
-        keys = rows.to(self.queries.weight)
-        return keys.unflatten(0, local.shape[:2])
-
-    def _keys_without_gradients(self, local: Tensor) -> Tensor:
-        """Return the same keys with BatchNorm fused into the layers, which takes half the time."""
-        norm = self.rho_first[0]
-        assert isinstance(norm, nn.BatchNorm1d)
-        of_points = fused_layer(self.rho_local, norm)
-        global_layer = fused_layer(self.rho_global, norm)
-        of_cloud = F.linear(local.amax(1), global_layer.weight, of_points.bias)
-        hidden = F.linear(local, of_points.weight).add_(of_cloud[:, None])
-        return hidden.relu_().to(self.queries.weight)
+            keys = F.relu_(hidden)
+        return keys.to(self.queries.weight)

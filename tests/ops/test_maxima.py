@@ -1,0 +1,38 @@
+"""Maxima over points and neighbourhoods."""
+
+import pytest
+import torch
+
+from mops_lightning.ops.maxima import max_of_points
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
+def test_max_of_points_equals_amax_and_so_do_its_gradients(dtype, rng):
+    features = torch.randn(3, 50, 7, generator=rng).to(dtype).requires_grad_()
+    given = torch.randn(3, 7, generator=rng).to(dtype)
+
+    largest = max_of_points(features)
+
+    expected = features.amax(1)
+    assert largest.equal(expected)
+    (gradient,) = torch.autograd.grad(largest, features, given)
+    (expected_gradient,) = torch.autograd.grad(expected, features, given)
+    assert gradient.equal(expected_gradient)
+
+
+def test_max_of_points_gives_the_gradient_of_tied_points_to_the_first():
+    features = torch.tensor([[[1.0], [2.0], [2.0]]], requires_grad=True)
+
+    max_of_points(features).sum().backward()
+
+    assert features.grad is not None
+    assert features.grad.flatten().tolist() == [0.0, 1.0, 0.0]
+
+
+def test_max_of_points_passes_on_what_is_not_a_number():
+    features = torch.tensor([[[1.0, 3.0], [float("nan"), 2.0]]])
+
+    largest = max_of_points(features)
+
+    assert largest[0, 0].isnan()
+    assert largest[0, 1] == 3.0
