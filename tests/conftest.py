@@ -8,6 +8,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 import random
 import shutil
 from collections.abc import Callable, Iterator
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -120,6 +121,18 @@ def real_data() -> Callable[[str], Path]:
 @pytest.fixture
 def rng() -> torch.Generator:
     return torch.Generator().manual_seed(0)
+
+
+@pytest.fixture
+def randn(rng: torch.Generator) -> Callable[..., torch.Tensor]:
+    """``torch.randn`` with the generator of the test."""
+    return partial(torch.randn, generator=rng)
+
+
+@pytest.fixture
+def rand(rng: torch.Generator) -> Callable[..., torch.Tensor]:
+    """``torch.rand`` with the generator of the test."""
+    return partial(torch.rand, generator=rng)
 
 
 PATIENCE = 120_000

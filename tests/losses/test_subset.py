@@ -3,6 +3,7 @@ from statistics import mean
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from mops_lightning.losses.subset import overlap_losses, simplification_losses, subset_losses
 from mops_lightning.ops.sampling_matrix import SamplingMatrix
@@ -10,9 +11,9 @@ from tests.support.losses import simplification_loss, subset_loss
 from tests.support.plain import squared
 
 
-def test_subset_loss_equals_double_loop(rng):
-    points = torch.randn(3, 12, 3, dtype=torch.float64, generator=rng)
-    samples = torch.randn(3, 5, 3, dtype=torch.float64, generator=rng, requires_grad=True)
+def test_subset_loss_equals_double_loop(randn):
+    points = randn(3, 12, 3, dtype=torch.float64)
+    samples = randn(3, 5, 3, dtype=torch.float64, requires_grad=True)
 
     def loss_of(samples):
         return subset_loss(points, samples)
@@ -24,15 +25,15 @@ def test_subset_loss_equals_double_loop(rng):
         for q in sample:
             nearest.append(min(squared(q, p) for p in cloud))
     expected = torch.stack(nearest).mean()
-    torch.testing.assert_close(loss, expected)
+    assert_close(loss, expected)
     gradient = torch.autograd.grad(loss, samples)
     expected_gradient = torch.autograd.grad(expected, samples)
-    torch.testing.assert_close(gradient, expected_gradient)
+    assert_close(gradient, expected_gradient)
     assert torch.autograd.gradcheck(loss_of, (samples,))
 
 
-def test_subset_loss_of_input_points_is_zero(rng):
-    points = torch.randn(3, 12, 3, dtype=torch.float64, generator=rng)
+def test_subset_loss_of_input_points_is_zero(randn):
+    points = randn(3, 12, 3, dtype=torch.float64)
     assert subset_loss(points, points[:, 3:7]) == 0
 
 
@@ -56,9 +57,9 @@ def plain_nearest(points, others):
 
 
 @pytest.mark.parametrize(("coverage", "per_point"), [(1.0, 0.0), (0.5, 1 / 30), (0.0, 1 / 64)])
-def test_simplification_loss_equals_double_loop(coverage, per_point, rng):
-    points = torch.randn(3, 17, 3, generator=rng)
-    samples = torch.randn(3, 5, 3, generator=rng)
+def test_simplification_loss_equals_double_loop(coverage, per_point, randn):
+    points = randn(3, 17, 3)
+    samples = randn(3, 5, 3)
 
     value = simplification_loss(points, samples, coverage, per_point)
 
@@ -70,23 +71,23 @@ def test_simplification_loss_equals_double_loop(coverage, per_point, rng):
     ("losses", "loss", "weights"),
     [(subset_losses, subset_loss, ()), (simplification_losses, simplification_loss, (0.5, 0.1))],
 )
-def test_losses_of_several_sizes_equal_each_size(losses, loss, weights, rng):
-    points = torch.randn(3, 30, 3, generator=rng, dtype=torch.float64)
-    samples = torch.randn(3, 12, 3, generator=rng, dtype=torch.float64, requires_grad=True)
+def test_losses_of_several_sizes_equal_each_size(losses, loss, weights, randn):
+    points = randn(3, 30, 3, dtype=torch.float64)
+    samples = randn(3, 12, 3, dtype=torch.float64, requires_grad=True)
     sizes = (12, 1, 5)
     together = losses(points, samples, sizes, *weights)
     assert set(together) == set(sizes)
     for m in sizes:
         alone = loss(points, samples[:, :m].clone(), *weights)
-        torch.testing.assert_close(together[m], alone)
+        assert_close(together[m], alone)
         (got,) = torch.autograd.grad(together[m], samples, retain_graph=True)
         (want,) = torch.autograd.grad(alone, samples)
-        torch.testing.assert_close(got, want)
+        assert_close(got, want)
 
 
-def test_simplification_loss_has_weights_of_one_and_zero_by_default(rng):
-    points = torch.randn(3, 17, 3, generator=rng)
-    samples = torch.randn(3, 5, 3, generator=rng)
+def test_simplification_loss_has_weights_of_one_and_zero_by_default(randn):
+    points = randn(3, 17, 3)
+    samples = randn(3, 5, 3)
 
     value = simplification_loss(points, samples)
 
@@ -106,10 +107,10 @@ def plain_overlap(matrix, m):
 
 
 @pytest.mark.parametrize("per_cloud", [False, True])
-def test_overlap_losses_equal_loop_over_pairs(per_cloud, rng):
+def test_overlap_losses_equal_loop_over_pairs(per_cloud, randn):
     shape = (3, 7, 5) if per_cloud else (7, 5)
-    queries = torch.randn(shape, dtype=torch.float64, generator=rng, requires_grad=True)
-    keys = torch.randn(3, 20, 5, dtype=torch.float64, generator=rng, requires_grad=True)
+    queries = randn(shape, dtype=torch.float64, requires_grad=True)
+    keys = randn(3, 20, 5, dtype=torch.float64, requires_grad=True)
     matrix = SamplingMatrix(queries, keys, 0.3)
 
     losses = overlap_losses(matrix, (2, 5, 7))
@@ -117,10 +118,10 @@ def test_overlap_losses_equal_loop_over_pairs(per_cloud, rng):
     assert list(losses) == [2, 5, 7]
     for m, loss in losses.items():
         expected = plain_overlap(matrix, m)
-        torch.testing.assert_close(loss, expected)
+        assert_close(loss, expected)
         gradients = torch.autograd.grad(loss, (queries, keys), retain_graph=True)
         expected_gradients = torch.autograd.grad(expected, (queries, keys))
-        torch.testing.assert_close(gradients, expected_gradients)
+        assert_close(gradients, expected_gradients)
 
 
 def test_overlap_is_zero_for_columns_without_common_points():

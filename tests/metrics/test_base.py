@@ -3,6 +3,7 @@ import json
 import pytest
 import torch
 from torch.nn import functional as F
+from torch.testing import assert_close
 
 from mops_lightning.metrics import classification, reconstruction, registration, sampled_set
 from mops_lightning.metrics.base import TableMetric, collection
@@ -92,7 +93,7 @@ def test_metric_of_two_processes_with_equal_data_equals_that_of_one(metric):
     given = batch(metric)
     for one in (alone, shared):
         one.update(*given)
-    torch.testing.assert_close(shared.compute(), alone.compute())
+    assert_close(shared.compute(), alone.compute())
     assert alone.compute() > 0
 
 

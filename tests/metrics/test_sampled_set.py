@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial import cKDTree
+from torch.testing import assert_close
 
 from mops_lightning import SampleOutput, SamplingMatrix
 from mops_lightning.metrics.sampled_set import SET_METRICS
@@ -14,23 +15,23 @@ def values(name, points, output):
     if found is None:
         return None
     head = SET_METRICS[name].measure(points, output.first(2), (2,)) or {}
-    torch.testing.assert_close(found[2], head[2])
+    assert_close(found[2], head[2])
     return found[m]
 
 
 @pytest.fixture
-def clouds(rng):
-    return torch.randn(3, 40, 3, generator=rng)
+def clouds(randn):
+    return randn(3, 40, 3)
 
 
-def test_subset_distance_matches_kd_tree(clouds, rng):
-    samples = torch.randn(3, 7, 3, generator=rng)
+def test_subset_distance_matches_kd_tree(clouds, randn):
+    samples = randn(3, 7, 3)
     got = values("generated/subset_distance", clouds, SampleOutput(samples, None, {}))
     want = [
         np.square(cKDTree(c.numpy()).query(s.numpy())[0]).mean()
         for c, s in zip(clouds, samples, strict=True)
     ]
-    torch.testing.assert_close(got, torch.tensor(want, dtype=torch.float32))
+    assert_close(got, torch.tensor(want, dtype=torch.float32))
 
 
 def test_unique_points_counts_each_match_once(clouds):
@@ -66,7 +67,7 @@ def test_matrix_metrics_match_ideal_matrix(clouds):
 
     one_of_40 = 100 / 40
     assert percent.tolist() == pytest.approx([one_of_40, one_of_40, one_of_40])
-    torch.testing.assert_close(error, torch.zeros(3), atol=1e-5, rtol=1e-5)
+    assert_close(error, torch.zeros(3), atol=1e-5, rtol=1e-5)
 
 
 def test_matrix_metrics_match_uniform_matrix(clouds):
@@ -80,7 +81,7 @@ def test_matrix_metrics_match_uniform_matrix(clouds):
     off_diagonal = 20 / 40**2
     expected = (diagonal + off_diagonal) ** 0.5
     assert percent.tolist() == pytest.approx([100, 100, 100])
-    torch.testing.assert_close(error, torch.full((3,), expected), atol=1e-5, rtol=1e-5)
+    assert_close(error, torch.full((3,), expected), atol=1e-5, rtol=1e-5)
 
 
 def test_nonzero_percent_counts_each_column(clouds):

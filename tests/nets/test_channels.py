@@ -4,6 +4,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from mops_lightning.channels import Channel, PointChannels
 from mops_lightning.nets.atlasnet import AtlasNet
@@ -36,9 +37,9 @@ WITH_NORMALS = PointChannels(
 
 
 @pytest.mark.parametrize("name", NETS)
-def test_net_reads_every_channel_independent_of_order_and_batch(name, rng):
+def test_net_reads_every_channel_independent_of_order_and_batch(name, rng, randn):
     net = NETS[name](2).eval()
-    points = torch.randn(3, 40, 5, generator=rng, requires_grad=True)
+    points = randn(3, 40, 5, requires_grad=True)
     order = torch.randperm(40, generator=rng)
 
     out = net(points)
@@ -48,9 +49,9 @@ def test_net_reads_every_channel_independent_of_order_and_batch(name, rng):
     (gradient,) = torch.autograd.grad(out.square().sum(), points)
     by_channel = gradient.abs().sum((0, 1))
     assert (by_channel > 0).all()
-    torch.testing.assert_close(alone, out[1:2], atol=1e-5, rtol=1e-4)
+    assert_close(alone, out[1:2], atol=1e-5, rtol=1e-4)
     expected = out[:, order] if name == "segmentation" else out
-    torch.testing.assert_close(in_order, expected, atol=1e-5, rtol=1e-4)
+    assert_close(in_order, expected, atol=1e-5, rtol=1e-4)
 
 
 @pytest.mark.parametrize("name", NETS)
@@ -65,24 +66,24 @@ def test_weights_have_the_names_of_a_net_without_channels(name):
         assert wider[key].shape[1] == default[key].shape[1] + 2
 
 
-def test_dgcnn_finds_the_first_neighbours_by_coordinates(rng):
+def test_dgcnn_finds_the_first_neighbours_by_coordinates(randn):
     net = DGCNN(5, k=4, point_channels=1).eval()
     first: Any = net.edges[0]
     torch.nn.init.zeros_(first.own.weight[:, 3:])
     torch.nn.init.zeros_(first.edge.weight[:, 3:])
-    points = torch.randn(2, 30, 4, generator=rng)
+    points = randn(2, 30, 4)
     changed = points.clone()
     changed[..., 3] *= 100
 
-    torch.testing.assert_close(net(changed), net(points))
+    assert_close(net(changed), net(points))
 
 
-def test_pcrnet_turns_normals_with_the_source(rng):
+def test_pcrnet_turns_normals_with_the_source(randn):
     torch.manual_seed(0)
     net = PCRNet(iterations=2, feature_channels=(8, 16), point_channels=WITH_NORMALS).eval()
     net.motion.bias.data = torch.tensor([1.0, 0.5, 0, 0, 0.1, 0, 0])
-    source = torch.randn(2, 30, 7, generator=rng)
-    target = torch.randn(2, 30, 7, generator=rng)
+    source = randn(2, 30, 7)
+    target = randn(2, 30, 7)
 
     found = net(source, target)
 
@@ -90,8 +91,8 @@ def test_pcrnet_turns_normals_with_the_source(rng):
     first = net(source, target)
     moved = move(source, first, WITH_NORMALS)
     both = net(moved, target).after(first)
-    torch.testing.assert_close(found.translation, both.translation)
-    torch.testing.assert_close(found.quaternion, both.quaternion)
+    assert_close(found.translation, both.translation)
+    assert_close(found.quaternion, both.quaternion)
 
 
 def test_move_turns_normals_and_leaves_other_channels():
@@ -102,11 +103,11 @@ def test_move_turns_normals_and_leaves_other_channels():
     moved = move(points, Motion(quarter_turn, shift), WITH_NORMALS)
 
     expected = torch.tensor([[[5.0, 1.0, 0, 7.0, 0, 1.0, 0]]])
-    torch.testing.assert_close(moved, expected)
+    assert_close(moved, expected)
 
 
-def test_move_without_channels_is_the_motion(rng):
+def test_move_without_channels_is_the_motion(rng, randn):
     motion = random_motion(45, 1.0, [rng, rng])
-    points = torch.randn(2, 9, 3, generator=rng)
+    points = randn(2, 9, 3)
 
     assert torch.equal(move(points, motion, PointChannels()), motion.apply(points))

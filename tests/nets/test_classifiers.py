@@ -3,6 +3,7 @@
 from typing import Any
 
 import torch
+from torch.testing import assert_close
 
 from mops_lightning.nets.dgcnn import DGCNN
 from mops_lightning.nets.pointnet import PointNetTransform, TransformNet
@@ -11,9 +12,9 @@ from mops_lightning.ops.maxima import max_of_rows
 from mops_lightning.ops.points import gather_points
 
 
-def test_transform_net_starts_at_identity(rng):
-    matrix = TransformNet(4)(torch.randn(3, 20, 4, generator=rng))
-    torch.testing.assert_close(matrix, torch.eye(4).expand(3, 4, 4))
+def test_transform_net_starts_at_identity(randn):
+    matrix = TransformNet(4)(randn(3, 20, 4))
+    assert_close(matrix, torch.eye(4).expand(3, 4, 4))
 
 
 def set_bias(transform, matrix):
@@ -22,12 +23,12 @@ def set_bias(transform, matrix):
 
 
 @torch.no_grad()
-def test_pointnet_transforms_multiply_rows_of_points_and_of_features(rng):
+def test_pointnet_transforms_multiply_rows_of_points_and_of_features(randn):
     """The first transform moves the points, the second one can be part of the next layer."""
     net: Any = PointNetTransform(5).eval()
-    points = torch.randn(2, 30, 3, generator=rng)
-    of_points = torch.randn(3, 3, generator=rng)
-    noise = torch.randn(64, 64, generator=rng)
+    points = randn(2, 30, 3)
+    of_points = randn(3, 3)
+    noise = randn(64, 64)
     of_features = torch.eye(64) + 0.3 * noise
     next_layer = net.features.layers[0].weight
     set_bias(net.point_transform, of_points)
@@ -39,7 +40,7 @@ def test_pointnet_transforms_multiply_rows_of_points_and_of_features(rng):
     set_bias(net.feature_transform, torch.eye(64))
     next_layer.copy_(next_layer @ of_features.mT)
     expected = net(points @ of_points)
-    torch.testing.assert_close(logits, expected, atol=1e-5, rtol=1e-4)
+    assert_close(logits, expected, atol=1e-5, rtol=1e-4)
 
 
 def plain_edge_convolution(layer, features):
@@ -52,10 +53,10 @@ def plain_edge_convolution(layer, features):
     return normed.relu().unflatten(0, features.shape[:2])
 
 
-def test_dgcnn_neighbours_are_found_in_the_space_of_features(rng):
+def test_dgcnn_neighbours_are_found_in_the_space_of_features(randn):
     """Every edge convolution has a graph of its own."""
     net: Any = DGCNN(5, k=4, edge_channels=(8, 8)).eval()
-    points = torch.randn(2, 30, 3, generator=rng)
+    points = randn(2, 30, 3)
 
     logits = net(points)
 
@@ -65,20 +66,20 @@ def test_dgcnn_neighbours_are_found_in_the_space_of_features(rng):
         features = plain_edge_convolution(layer, features)
         outputs.append(features)
     pooled = net.pool(torch.cat(outputs, 2))
-    torch.testing.assert_close(logits, net.head(pooled), atol=1e-5, rtol=1e-4)
+    assert_close(logits, net.head(pooled), atol=1e-5, rtol=1e-4)
 
 
-def test_max_of_rows_equals_maximum_of_gathered_rows(rng, monkeypatch):
+def test_max_of_rows_equals_maximum_of_gathered_rows(rng, randn, monkeypatch):
     monkeypatch.setattr(compiled, "THREADS_MIN_WORK", 1)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
-    features = torch.randn(2, 20, 6, generator=rng, requires_grad=True)
+    features = randn(2, 20, 6, requires_grad=True)
     rows = torch.randint(20, (2, 9, 4), generator=rng)
 
     maxima = max_of_rows(features, rows)
 
     expected = gather_points(features, rows).amax(2)
-    torch.testing.assert_close(maxima, expected)
-    direction = torch.randn(maxima.shape, generator=rng)
+    assert_close(maxima, expected)
+    direction = randn(maxima.shape)
     gradient = torch.autograd.grad((maxima * direction).sum(), features)
     expected_gradient = torch.autograd.grad((expected * direction).sum(), features)
-    torch.testing.assert_close(gradient, expected_gradient)
+    assert_close(gradient, expected_gradient)

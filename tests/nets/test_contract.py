@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from mops_lightning.errors import UserError
 from mops_lightning.nets.atlasnet import AtlasNet
@@ -35,9 +36,9 @@ ALL = {**NETS, **CLASSIFIERS}
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_output_is_independent_of_order_and_batch(name, rng):
+def test_output_is_independent_of_order_and_batch(name, rng, randn):
     net = ALL[name](50).eval()
-    points = torch.randn(3, 40, 3, generator=rng)
+    points = randn(3, 40, 3)
     order = torch.randperm(40, generator=rng)
     shape = (3, 5) if name in CLASSIFIERS else (3, 50, 3)
 
@@ -46,20 +47,20 @@ def test_output_is_independent_of_order_and_batch(name, rng):
     out_alone = net(points[1:2])
 
     assert out.shape == shape
-    torch.testing.assert_close(out_in_order, out, atol=1e-5, rtol=1e-4)
-    torch.testing.assert_close(out_alone, out[1:2], atol=1e-5, rtol=1e-4)
+    assert_close(out_in_order, out, atol=1e-5, rtol=1e-4)
+    assert_close(out_alone, out[1:2], atol=1e-5, rtol=1e-4)
     assert net(points[:, :7]).shape == shape
     assert net(points[:, :1]).shape == shape
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_all_parameters_have_gradients(name, rng):
+def test_all_parameters_have_gradients(name, randn):
     net = ALL[name](50)
     for module in net.modules():
         if isinstance(module, TransformNet):  # its last weights are zero, which stops gradients
             *_, last_weight, _ = module.head.parameters()
             torch.nn.init.normal_(last_weight, std=0.01)
-    points = torch.randn(3, 40, 3, generator=rng)
+    points = randn(3, 40, 3)
 
     net(points).square().sum().backward()
 
@@ -69,39 +70,39 @@ def test_all_parameters_have_gradients(name, rng):
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_mixed_precision_is_close_with_finite_gradients(name, rng):
+def test_mixed_precision_is_close_with_finite_gradients(name, randn):
     net = ALL[name](50).eval()
-    points = torch.randn(8, 60, 3, generator=rng)
+    points = randn(8, 60, 3)
     single = net(points)
     half = mixed(net, points)
     assert half.dtype == torch.float32
-    torch.testing.assert_close(half, single, rtol=0.05, atol=0.05)
+    assert_close(half, single, rtol=0.05, atol=0.05)
     half.square().sum().backward()
     assert all(p.grad is not None and p.grad.isfinite().all() for p in net.parameters())
 
 
 @pytest.mark.parametrize("name", ["foldingnet", "mfoldingnet", "atlasnet"])
 @pytest.mark.parametrize("n", [4, 7, 50, 101, 300])
-def test_number_of_points_is_variable(name, n, rng):
+def test_number_of_points_is_variable(name, n, randn):
     net = NETS[name](50).eval()
-    points = torch.randn(2, 40, 3, generator=rng)
+    points = randn(2, 40, 3)
     assert net(points, n).shape == (2, n, 3)
     net.n_points = n
-    torch.testing.assert_close(net(points), net(points, n))
+    assert_close(net(points), net(points, n))
 
 
 @pytest.mark.parametrize("name", NETS)
-def test_result_follows_from_maxima_of_point_features(name, rng):
+def test_result_follows_from_maxima_of_point_features(name, randn):
     net: Any = ALL[name](50).eval()
-    points = torch.randn(2, 40, 3, generator=rng)
+    points = randn(2, 40, 3)
 
     features = net.point_features(points)
     features_of_two = net.point_features(points[:, 7:9])
 
     assert features.min() >= 0
     maxima = features.amax(1)
-    torch.testing.assert_close(net.from_pooled(maxima), net(points))
-    torch.testing.assert_close(features_of_two, features[:, 7:9])
+    assert_close(net.from_pooled(maxima), net(points))
+    assert_close(features_of_two, features[:, 7:9])
 
 
 @pytest.mark.parametrize(
@@ -121,10 +122,10 @@ def test_autoencoder_has_published_size():
     assert megabytes == pytest.approx(4.1, abs=0.2)
 
 
-def test_point_features_global_is_maximum_of_local(rng):
-    local, global_ = PointFeatures(PointMLP([3, 8, 6])).eval()(torch.randn(2, 30, 3, generator=rng))
+def test_point_features_global_is_maximum_of_local(randn):
+    local, global_ = PointFeatures(PointMLP([3, 8, 6])).eval()(randn(2, 30, 3))
     assert local.shape == (2, 30, 6)
-    torch.testing.assert_close(global_, local.max(1).values)
+    assert_close(global_, local.max(1).values)
 
 
 POINTS = torch.ones(2, 40, 3)
@@ -159,9 +160,9 @@ def test_invalid_argument_raises(make, message):
         make()
 
 
-def test_atlasnet_is_random_in_training_only(rng):
+def test_atlasnet_is_random_in_training_only(randn):
     net = AtlasNet(50, 3, 16, (32, 8))
-    points = torch.randn(2, 40, 3, generator=rng)
+    points = randn(2, 40, 3)
     assert not torch.equal(net(points), net(points))
     net.eval()
     assert torch.equal(net(points), net(points))

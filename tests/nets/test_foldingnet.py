@@ -1,6 +1,7 @@
 import pytest
 import torch
 from torch.nn import functional as F
+from torch.testing import assert_close
 
 from mops_lightning.nets import foldingnet
 from mops_lightning.nets.foldingnet import REACH, Fold, FoldingDecoder, MFoldingNet, square_grid
@@ -30,24 +31,24 @@ def plain_folding(decoder, codeword, n):
     return points
 
 
-def test_decoder_with_one_piece_equals_foldingnet(rng):
+def test_decoder_with_one_piece_equals_foldingnet(randn):
     decoder = FoldingDecoder(16, 1, (32, 8))
-    codeword = torch.randn(3, 16, generator=rng)
+    codeword = randn(3, 16)
     plain = plain_folding(decoder, codeword, 48)
-    torch.testing.assert_close(decoder(codeword, 48), plain, atol=1e-5, rtol=1e-4)
+    assert_close(decoder(codeword, 48), plain, atol=1e-5, rtol=1e-4)
 
 
-def test_decoder_pieces_share_weights(rng):
+def test_decoder_pieces_share_weights(randn):
     decoder = FoldingDecoder(16, 4, (32, 8))
     of_one_piece = FoldingDecoder(4, 1, (32, 8))
     of_one_piece.load_state_dict(decoder.state_dict())
-    codeword = torch.randn(2, 16, generator=rng)
+    codeword = randn(2, 16)
 
     out = decoder(codeword, 48).unflatten(1, (12, 4))
 
     for piece, part in enumerate(codeword.chunk(4, dim=1)):
         alone = of_one_piece(part, 12)
-        torch.testing.assert_close(out[:, :, piece], alone, atol=1e-5, rtol=1e-4)
+        assert_close(out[:, :, piece], alone, atol=1e-5, rtol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -67,30 +68,30 @@ def test_mfoldingnet_has_published_size(codeword, published, tolerance):
 @pytest.mark.parametrize("shared", [True, False])
 @pytest.mark.parametrize("rows", [4, 10, 1000])
 @pytest.mark.parametrize("channels", [(12,), (12, 5), (12, 5, 4)])
-def test_fold_in_blocks_equals_plain_folding(channels, rows, shared, rng, monkeypatch):
+def test_fold_in_blocks_equals_plain_folding(channels, rows, shared, randn, monkeypatch):
     monkeypatch.setitem(foldingnet.BLOCK_ROWS, "cpu", rows)
     torch.manual_seed(0)
     fold = Fold(6, 3, channels).double()
     number = 1 if shared else 5
-    pieces = torch.randn(5, 6, generator=rng, dtype=torch.float64).requires_grad_()
-    coordinates = torch.randn(number, 7, 3, generator=rng, dtype=torch.float64).requires_grad_()
-    direction = torch.randn(5, 7, 3, generator=rng, dtype=torch.float64)
+    pieces = randn(5, 6, dtype=torch.float64).requires_grad_()
+    coordinates = randn(number, 7, 3, dtype=torch.float64).requires_grad_()
+    direction = randn(5, 7, 3, dtype=torch.float64)
 
     folded = fold(pieces, coordinates)
 
     hidden = fold.from_piece(pieces)[:, None] + fold.from_coordinates(coordinates)
     expected = fold.rest(fold.narrow(hidden.relu()))
-    torch.testing.assert_close(folded, expected)
+    assert_close(folded, expected)
     inputs = (pieces, coordinates, *fold.parameters())
     gradients = torch.autograd.grad((folded * direction).sum(), inputs)
     expected_gradients = torch.autograd.grad((expected * direction).sum(), inputs)
-    torch.testing.assert_close(gradients, expected_gradients)
+    assert_close(gradients, expected_gradients)
 
 
-def test_fold_does_not_save_hidden_layer(rng):
+def test_fold_does_not_save_hidden_layer(randn):
     """For a cloud of 40,960 points, every hidden layer would take 335 MB."""
     fold = Fold(16, 3, (2048, 144))
-    pieces = torch.randn(4, 16, generator=rng, requires_grad=True)
+    pieces = randn(4, 16, requires_grad=True)
     saved = []
 
     def save(tensor):
@@ -98,5 +99,5 @@ def test_fold_does_not_save_hidden_layer(rng):
         return tensor
 
     with torch.autograd.graph.saved_tensors_hooks(save, lambda tensor: tensor):
-        fold(pieces, torch.randn(4, 500, 3, generator=rng))
+        fold(pieces, randn(4, 500, 3))
     assert max(saved) < 2000 * 2048 // 8

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 import mops_lightning as mops
 from mops_lightning.config.build import build
@@ -31,9 +32,9 @@ SAMPLERS: tuple[Any, ...] = (
 
 
 @pytest.mark.parametrize("sampler", SAMPLERS)
-def test_stages_train_any_sampler(sampler, rng):
+def test_stages_train_any_sampler(sampler, randn):
     net: Any = HierarchicalNet(5, sampler, (20, 8), (8, 16, 16), 4)
-    points = torch.randn(4, 40, 3, generator=rng)
+    points = randn(4, 40, 3)
 
     logits = net(points)
     loss = logits.square().sum() + sum(net.losses.values())
@@ -50,7 +51,7 @@ def sizes_of_levels(net, points):
     return [level.shape[1] for level, _ in net.levels(points)]
 
 
-def test_fmops_by_name_draws_a_size_for_every_step(rng):
+def test_fmops_by_name_draws_a_size_for_every_step(randn):
     cfg = compose(
         [
             "task/net=hierarchical",
@@ -59,7 +60,7 @@ def test_fmops_by_name_draws_a_size_for_every_step(rng):
         ]
     )
     net: Any = build(cfg.task.net, "task.net", num_classes=5)
-    points = torch.randn(4, 40, 3, generator=rng)
+    points = randn(4, 40, 3)
 
     drawn = torch.tensor([sizes_of_levels(net, points)[1:] for _ in range(9)])
     of_few_points = sizes_of_levels(net.eval(), points[:, :10])
@@ -116,22 +117,22 @@ def gradients_of(forward, stage, points, features):
 
 
 @pytest.mark.parametrize("sampler", [mops.FPSSampler, mops.MOPSNet])
-def test_stage_equals_maximum_over_explicit_edges(sampler, rng):
+def test_stage_equals_maximum_over_explicit_edges(sampler, randn):
     stage = Stage(sampler(m=7), 7, 6, 10, 4).eval()
-    points = torch.randn(2, 30, 3, generator=rng).requires_grad_()
-    features = torch.randn(2, 30, 6, generator=rng).requires_grad_()
+    points = randn(2, 30, 3).requires_grad_()
+    features = randn(2, 30, 6).requires_grad_()
 
     fast = gradients_of(stage, stage, points, features)
     plain = gradients_of(partial(plain_stage, stage), stage, points, features)
 
-    torch.testing.assert_close(fast, plain, atol=1e-4, rtol=1e-3)
+    assert_close(fast, plain, atol=1e-4, rtol=1e-3)
 
 
 @pytest.mark.parametrize("sampler", [mops.FPSSampler, mops.MOPSNet])
-def test_stage_of_equal_points_has_finite_gradients(sampler, rng):
+def test_stage_of_equal_points_has_finite_gradients(sampler, randn):
     stage = Stage(sampler(m=7), 7, 6, 10, 4).eval()
     points = torch.zeros(2, 30, 3, requires_grad=True)
-    features = torch.randn(2, 30, 6, generator=rng)
+    features = randn(2, 30, 6)
 
     _, found = stage(points, features)
     found.sum().backward()
@@ -140,32 +141,32 @@ def test_stage_of_equal_points_has_finite_gradients(sampler, rng):
     assert points.grad.isfinite().all()
 
 
-def test_points_without_matrix_carry_the_feature_of_the_nearest_point(rng):
-    points = torch.randn(2, 30, 3, generator=rng)
-    features = torch.randn(2, 30, 6, generator=rng)
+def test_points_without_matrix_carry_the_feature_of_the_nearest_point(randn):
+    points = randn(2, 30, 3)
+    features = randn(2, 30, 6)
     output = mops.SNet(m=5).eval()(points)
 
     found = carried(output, points, features)
 
     nearest = torch.cdist(output.points, points).argmin(2)
-    torch.testing.assert_close(found, gather_points(features, nearest))
+    assert_close(found, gather_points(features, nearest))
 
 
-def test_stage_of_fewer_points_than_its_sampler_returns_is_refused(rng):
-    points = torch.randn(2, 4, 3, generator=rng)
-    features = torch.randn(2, 4, 6, generator=rng)
+def test_stage_of_fewer_points_than_its_sampler_returns_is_refused(randn):
+    points = randn(2, 4, 3)
+    features = randn(2, 4, 6)
     stage = Stage(mops.SNet(m=5), 5, 6, 10, 4)
 
     with pytest.raises(UserError, match=r"task\.net\.points .* 4 points .* SNet returns 5"):
         stage(points, features)
 
 
-def test_losses_of_stages_are_part_of_the_step(rng):
+def test_losses_of_stages_are_part_of_the_step(randn):
     torch.manual_seed(0)
     sampler = partial(mops.MOPSNet, alpha=2.0)
     net = HierarchicalNet(5, sampler, (20, 8), (8, 16, 16), 4)
     task = Classification(net, 5)
-    points = torch.randn(4, 40, 3, generator=rng)
+    points = randn(4, 40, 3)
     batch = Batch(points, torch.tensor([0, 1, 2, 3]))
 
     losses = task.step(batch, points).losses

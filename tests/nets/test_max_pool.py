@@ -1,6 +1,7 @@
 import pytest
 import torch
 from torch.nn import functional as F
+from torch.testing import assert_close
 
 from mops_lightning.nets.max_pool import GROUP, PLAIN_MAX_POINTS, PointMaxPool, blocked_argmax
 
@@ -30,12 +31,12 @@ def pools(channels_in=6, channels_out=20, norm=True):
 @pytest.mark.parametrize("norm", [True, False])
 @pytest.mark.parametrize("training", [True, False])
 @pytest.mark.parametrize("points", [4, PLAIN_MAX_POINTS, PLAIN_MAX_POINTS + 1, 50, 100])
-def test_max_pool_equals_plain_layers(points, training, norm, rng):
+def test_max_pool_equals_plain_layers(points, training, norm, randn):
     fast, plain = pools(norm=norm)
     outputs = []
     gradients = []
-    features = torch.randn(3, points, 6, dtype=torch.float64, generator=rng)
-    weight = torch.randn(3, 20, dtype=torch.float64, generator=rng)
+    features = randn(3, points, 6, dtype=torch.float64)
+    weight = randn(3, 20, dtype=torch.float64)
     for net in (fast, plain):
         net.train()
         net(features + 1)  # running statistics that differ from the initial ones
@@ -47,32 +48,32 @@ def test_max_pool_equals_plain_layers(points, training, norm, rng):
         with torch.no_grad():  # the path without saved tensors
             net.eval()
             outputs.append(net(features))
-    torch.testing.assert_close(outputs[:2], outputs[2:])
+    assert_close(outputs[:2], outputs[2:])
     for got, want in zip(*gradients, strict=True):
-        torch.testing.assert_close(got, want)
+        assert_close(got, want)
     for (name, got), want in zip(fast.named_buffers(), plain.buffers(), strict=True):
-        torch.testing.assert_close(got, want, msg=name)
+        assert_close(got, want, msg=name)
 
 
-def test_max_pool_frozen_passes_gradients_to_input(rng):
+def test_max_pool_frozen_passes_gradients_to_input(randn):
     fast, plain = pools()
     for net in (fast, plain):
         net.requires_grad_(False).eval()
-    features = torch.randn(2, 60, 6, dtype=torch.float64, generator=rng, requires_grad=True)
+    features = randn(2, 60, 6, dtype=torch.float64, requires_grad=True)
     got, want = (torch.autograd.grad(net(features).sum(), features)[0] for net in (fast, plain))
-    torch.testing.assert_close(got, want)
+    assert_close(got, want)
 
 
-def test_max_pool_ignores_padding(rng):
+def test_max_pool_ignores_padding(randn):
     # Padding copies of the first point can exceed it by a rounding error; many sizes hit this case.
     for number in range(PLAIN_MAX_POINTS + 1, PLAIN_MAX_POINTS + 40):
         pool = PlainMaxPool(6, 40).double().eval()
-        features = torch.randn(2, number, 6, dtype=torch.float64, generator=rng)
+        features = randn(2, number, 6, dtype=torch.float64)
         features[:, 0] *= 5
         fast = PointMaxPool(6, 40).double().eval()
         fast.load_state_dict(pool.state_dict())
         features.requires_grad_()
-        torch.testing.assert_close(fast(features), pool(features))
+        assert_close(fast(features), pool(features))
 
 
 def test_blocked_argmax_of_ties_is_lowest_position(rng):

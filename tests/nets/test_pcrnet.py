@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from torch.testing import assert_close
 
 from mops_lightning.nets.pcrnet import PCRNet
 
@@ -46,9 +47,9 @@ def test_pcrnet_untrained_leaves_clouds_without_extent_as_they_are():
 
 
 @pytest.mark.parametrize("iterations", [1, 3])
-def test_pcrnet_is_independent_of_order_and_batch(iterations, rng):
+def test_pcrnet_is_independent_of_order_and_batch(iterations, rng, randn):
     module = net(iterations=iterations)
-    source, target = torch.randn(2, 4, 60, 3, generator=rng)
+    source, target = randn(2, 4, 60, 3)
     order = torch.randperm(60, generator=rng)
 
     motion = module(source, target)
@@ -56,10 +57,10 @@ def test_pcrnet_is_independent_of_order_and_batch(iterations, rng):
     alone = module(source[1:2], target[1:2])
     of_few_points = module(source[:, :20], target)
 
-    torch.testing.assert_close(motion.quaternion.norm(dim=1), torch.ones(4))
-    torch.testing.assert_close(in_order, motion, atol=1e-5, rtol=1e-5)
+    assert_close(motion.quaternion.norm(dim=1), torch.ones(4))
+    assert_close(in_order, motion, atol=1e-5, rtol=1e-5)
     second = motion.quaternion[1:2]
-    torch.testing.assert_close(alone.quaternion, second, atol=1e-5, rtol=1e-5)
+    assert_close(alone.quaternion, second, atol=1e-5, rtol=1e-5)
     assert of_few_points.translation.shape == (4, 3)
 
 
@@ -73,8 +74,8 @@ def homogeneous(motion):
     return matrices
 
 
-def test_pcrnet_pose_is_product_of_homogeneous_matrices(rng):
-    source, target = torch.randn(2, 4, 60, 3, generator=rng)
+def test_pcrnet_pose_is_product_of_homogeneous_matrices(randn):
+    source, target = randn(2, 4, 60, 3)
     one = net()
     three = net(iterations=3)
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
 from mops_lightning.errors import UserError
 from mops_lightning.nets.plane_icp import PlaneICP, nearest_rows, surface_normals, weighted_step
@@ -54,7 +55,7 @@ def test_icp_finds_the_motion_between_two_samples_of_a_box(pair):
     found = PlaneICP()(source, target)
 
     assert torch.rad2deg(rotation_angle(found.quaternion, true.quaternion)) < 0.5
-    torch.testing.assert_close(found.translation, true.translation, atol=0.005, rtol=0)
+    assert_close(found.translation, true.translation, atol=0.005, rtol=0)
 
 
 def test_icp_ends_where_small_gicp_ends(pair):
@@ -81,7 +82,7 @@ def test_points_beyond_the_distance_have_no_effect(pair):
 
     expected = PlaneICP()(source, target)
 
-    torch.testing.assert_close(PlaneICP()(far, target).quaternion, expected.quaternion)
+    assert_close(PlaneICP()(far, target).quaternion, expected.quaternion)
 
 
 def test_gradients_of_the_last_step_reach_the_source(pair):
@@ -100,8 +101,8 @@ def test_normals_of_a_plane_are_its_direction():
     assert surface_normals(plane)[0, :, 2].abs().numpy() == pytest.approx(1)
 
 
-def test_nearest_rows_of_moved_points_are_the_points_themselves(rng):
-    points = torch.rand(2, 40, 3, generator=rng)
+def test_nearest_rows_of_moved_points_are_the_points_themselves(rand):
+    points = rand(2, 40, 3)
 
     rows, distance = nearest_rows(points + 1e-4, points)
 

@@ -1,5 +1,6 @@
 import pytest
 import torch
+from torch.testing import assert_close
 
 from mops_lightning.ops.attention import Partial, attend
 
@@ -17,16 +18,16 @@ def plain_attend(queries, keys, values):
     return logits.softmax(1) @ values.double()
 
 
-def test_attend_equals_softmax(rng):
-    queries = torch.randn(600, 8, generator=rng, dtype=torch.float64) * 5
-    keys = torch.randn(2100, 8, generator=rng, dtype=torch.float64) * 5
-    values = torch.randn(2100, 3, generator=rng, dtype=torch.float64)
+def test_attend_equals_softmax(randn):
+    queries = randn(600, 8, dtype=torch.float64) * 5
+    keys = randn(2100, 8, dtype=torch.float64) * 5
+    values = randn(2100, 3, dtype=torch.float64)
 
     found = attend(queries, keys, values)
 
     expected = (queries @ keys.mT).softmax(1) @ values
     assert isinstance(found, Partial)
-    torch.testing.assert_close(found.result(), expected)
+    assert_close(found.result(), expected)
 
 
 @pytest.fixture(params=[-50.0, 30.0, 100.0, 3e4])
@@ -46,7 +47,7 @@ def test_attend_outlier_between_probes_equals_softmax(with_outlier):
     found = attend(queries, keys, values).result()
 
     expected = plain_attend(queries, keys, values)
-    torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=1e-5)
+    assert_close(found.double(), expected, rtol=1e-4, atol=1e-5)
 
 
 def test_attend_merges_parts_with_an_outlier(with_outlier):
@@ -58,7 +59,7 @@ def test_attend_merges_parts_with_an_outlier(with_outlier):
     rest = attend(queries, keys[2:], values[2:])
     merged = first.merge(outlier).merge(rest).result()
 
-    torch.testing.assert_close(merged, whole, rtol=1e-4, atol=1e-5)
+    assert_close(merged, whole, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
@@ -73,7 +74,7 @@ def test_attend_half_precision_does_not_overflow(dtype):
     logits = queries.double() @ keys.double().mT
     rounding = float(logits.abs().max()) * torch.finfo(dtype).eps
     expected = plain_attend(queries, keys, values)
-    torch.testing.assert_close(found.double(), expected, rtol=0, atol=2 * rounding)
+    assert_close(found.double(), expected, rtol=0, atol=2 * rounding)
 
 
 def test_attend_huge_logits_stay_in_range_of_values():
@@ -84,9 +85,9 @@ def test_attend_huge_logits_stay_in_range_of_values():
     assert found.total.min() >= 0.5
 
 
-def test_attend_many_points_keep_precision(rng):
+def test_attend_many_points_keep_precision(rand):
     queries, keys = torch.zeros(3, 4), torch.zeros(300_000, 4)
-    values = torch.rand(300_000, 3, generator=rng)
+    values = rand(300_000, 3)
     found = attend(queries, keys, values).result()
     expected = values.double().mean(0).float().expand(3, 3)
-    torch.testing.assert_close(found, expected, rtol=1e-6, atol=0)
+    assert_close(found, expected, rtol=1e-6, atol=0)

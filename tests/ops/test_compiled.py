@@ -110,18 +110,18 @@ def test_nearest_non_finite_equals_torch_form(place, wrong, rng, both):
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.float32])
-def test_nearest_non_contiguous_equals_torch_form(dtype, rng, both):
-    points = torch.rand(3, 400, 2, generator=rng).transpose(0, 2)[:, ::2]
-    queries = torch.rand(3, 2, 90, generator=rng).permute(1, 2, 0)
+def test_nearest_non_contiguous_equals_torch_form(dtype, rand, both):
+    points = rand(3, 400, 2).transpose(0, 2)[:, ::2]
+    queries = rand(3, 2, 90).permute(1, 2, 0)
 
     fast, plain = both(nearest_points, queries.to(dtype), points.to(dtype))
 
     assert torch.equal(fast[1], plain[1])
 
 
-def test_nearest_gradients_equal_torch_form(rng, both):
-    points = torch.rand(1, 60, 3, generator=rng, requires_grad=True)
-    queries = torch.rand(1, 50, 3, generator=rng)
+def test_nearest_gradients_equal_torch_form(rand, both):
+    points = rand(1, 60, 3, requires_grad=True)
+    queries = rand(1, 50, 3)
     fast, plain = both(
         lambda: torch.autograd.grad(nearest_points(queries, points)[0].sum(), points)
     )
@@ -176,17 +176,17 @@ def test_farthest_of_odd_points_equals_torch_form(kind, both):
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_farthest_in_threads_equals_torch_form(threads, rng, both, monkeypatch):
+def test_farthest_in_threads_equals_torch_form(threads, rand, both, monkeypatch):
     monkeypatch.setattr(farthest, "THREADS_MIN_WORK", 1)
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
-    points = torch.rand(5, 300, 3, generator=rng)
+    points = rand(5, 300, 3)
     fast, plain = both(farthest_point_sample, points, 100)
     assert torch.equal(fast, plain)
 
 
 @pytest.mark.parametrize("k", [1, 3])
-def test_compiled_forms_take_finite_points_only(k, rng):
-    finite = torch.rand(1, 30, 3, generator=rng)
+def test_compiled_forms_take_finite_points_only(k, rand):
+    finite = rand(1, 30, 3)
     with_nan = finite.clone()
     with_nan[0, 7, 0] = torch.nan
     indices = torch.zeros(1, 1, dtype=torch.int64)

@@ -7,6 +7,7 @@ from subprocess import PIPE
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from mops_lightning.errors import UserError
 from mops_lightning.ops.emd import earth_movers_distance, solve_assignments
@@ -28,7 +29,7 @@ def clouds(rng, *shape):
 @pytest.mark.parametrize("n", [1, 2, 5, 6])
 def test_emd_equals_best_bijection(n, rng):
     points, others = clouds(rng, 3, n)
-    torch.testing.assert_close(earth_movers_distance(points, others), plain_emd(points, others))
+    assert_close(earth_movers_distance(points, others), plain_emd(points, others))
 
 
 def kinds(n, rng):
@@ -80,7 +81,7 @@ def test_emd_gradcheck(block, rng):
 def test_emd_keeps_dtype(rng):
     points, others = clouds(rng, 2, 20)
     exact = earth_movers_distance(points, others)
-    torch.testing.assert_close(earth_movers_distance(points.float(), others.float()), exact.float())
+    assert_close(earth_movers_distance(points.float(), others.float()), exact.float())
     assert earth_movers_distance(points.half(), others.half()).dtype == torch.float16
 
 
@@ -138,8 +139,8 @@ def alive(pid):
 
 @pytest.mark.parametrize("value", [float("inf"), float("nan")])
 @pytest.mark.parametrize("block", [None, 16])
-def test_emd_of_cloud_that_is_not_finite_is_not_finite(value, block, rng):
-    points = torch.randn(2, 40, 3, generator=rng)
+def test_emd_of_cloud_that_is_not_finite_is_not_finite(value, block, randn):
+    points = randn(2, 40, 3)
     others = points.clone()
     others[1, 7] = value
     found = earth_movers_distance(points, others, block)

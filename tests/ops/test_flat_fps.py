@@ -45,10 +45,10 @@ def torch_cluster_fps(x, batch, ratio):
         (0.3, (7,)),
     ],
 )
-def test_flat_fps_equals_torch_cluster(sizes, ratio, shape, rng):
+def test_flat_fps_equals_torch_cluster(sizes, ratio, shape, randn):
     number = len(sizes)
     batch = torch.arange(number).repeat_interleave(torch.tensor(sizes))
-    x = torch.randn(len(batch), *shape, generator=rng)
+    x = randn(len(batch), *shape)
 
     rows = fps(x, batch, ratio, random_start=False, batch_size=number + 1)
 
@@ -58,9 +58,9 @@ def test_flat_fps_equals_torch_cluster(sizes, ratio, shape, rng):
         assert torch.equal(rows, without_batch)
 
 
-def test_ratio_of_each_cloud_is_its_own(rng):
-    first = torch.rand(30, 3, generator=rng)
-    second = torch.rand(30, 3, generator=rng)
+def test_ratio_of_each_cloud_is_its_own(rand):
+    first = rand(30, 3)
+    second = rand(30, 3)
     x = torch.cat([first, second])
     batch = torch.arange(2).repeat_interleave(30)
     ratios = torch.tensor([0.1, 0.5])
@@ -167,8 +167,8 @@ def test_fps_of_near_ties_is_that_of_float64_arithmetic(cloud, m, dtype):
     assert rows.tolist() == exact_farthest(points, number)
 
 
-def test_fps_of_an_array_is_that_of_a_tensor(rng):
-    x = torch.randn(90, 3, generator=rng)
+def test_fps_of_an_array_is_that_of_a_tensor(randn):
+    x = randn(90, 3)
     batch = torch.arange(3).repeat_interleave(torch.tensor([40, 20, 30]))
 
     of_array = fps(x.numpy(), batch.numpy(), 0.3, random_start=False)

@@ -9,8 +9,8 @@ from tests.support.plain import plain_farthest
 @pytest.mark.usefixtures("farthest_form")
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (20, 20), (32, 7), (75, 30)])
-def test_fps_equals_double_loop(n, m, dtype, rng):
-    points = torch.randn(3, n, 3, dtype=dtype, generator=rng)
+def test_fps_equals_double_loop(n, m, dtype, rng, randn):
+    points = randn(3, n, 3, dtype=dtype)
     start = torch.randint(n, (3,), generator=rng)
 
     indices = farthest_point_sample(points, m, start=start)
@@ -24,8 +24,8 @@ def test_fps_equals_double_loop(n, m, dtype, rng):
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (37, 37), (1024, 512), (10_000, 40), (20_000, 9)])
 @pytest.mark.parametrize("grid", [False, True])  # a grid has many ties and copies
-def test_fps_on_a_gpu_is_that_of_a_cpu(n, m, grid, rng):
-    points = torch.randn(3, n, 3, generator=rng)
+def test_fps_on_a_gpu_is_that_of_a_cpu(n, m, grid, rng, randn):
+    points = randn(3, n, 3)
     if grid:
         points = (4 * points).round()
     start = torch.randint(n, (3,), generator=rng)
@@ -38,9 +38,9 @@ def test_fps_on_a_gpu_is_that_of_a_cpu(n, m, grid, rng):
 
 @pytest.mark.usefixtures("farthest_form")
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (20, 20), (75, 30), (3000, 9)])
-def test_fps_multiplies_distances_by_weights(n, m, rng):
-    points = torch.randn(3, n, 3, dtype=torch.float64, generator=rng)
-    weight = torch.rand(3, n, generator=rng).square() * 100
+def test_fps_multiplies_distances_by_weights(n, m, randn, rand):
+    points = randn(3, n, 3, dtype=torch.float64)
+    weight = rand(3, n).square() * 100
     without_weight = n // 4
     weight[:, :without_weight] = 0  # these are the last
     number = min(m, n - without_weight)
@@ -60,8 +60,8 @@ def test_fps_equal_weights_change_nothing(rng):
     assert torch.equal(farthest_point_sample(points, 400, weight=weight), unweighted)
 
 
-def test_fps_start_is_given_or_zero(rng):
-    points = torch.randn(4, 30, 3, generator=rng)
+def test_fps_start_is_given_or_zero(randn):
+    points = randn(4, 30, 3)
     assert farthest_point_sample(points, 3, start=7)[:, 0].tolist() == [7] * 4
     assert farthest_point_sample(points, 3)[:, 0].tolist() == [0] * 4
 
@@ -97,10 +97,10 @@ def test_fps_single_cloud_raises():
 
 
 @pytest.mark.usefixtures("farthest_form")
-def test_fill_equals_double_loop(rng):
-    points = torch.randn(3, 45, 3, generator=rng)
+def test_fill_equals_double_loop(randn, rand):
+    points = randn(3, 45, 3)
     given = torch.tensor([1, 6, 12])
-    indices = torch.rand(3, 45, generator=rng).argsort(1)[:, :12]
+    indices = rand(3, 45).argsort(1)[:, :12]
 
     filled = farthest_point_fill(points, indices, given)
 
@@ -110,8 +110,8 @@ def test_fill_equals_double_loop(rng):
         assert filled[cloud].tolist() == expected
 
 
-def test_fill_of_points_with_gradients_equals_fill_without(rng):
-    points = torch.randn(2, 40, 3, generator=rng)
+def test_fill_of_points_with_gradients_equals_fill_without(randn):
+    points = randn(2, 40, 3)
     indices, given = torch.arange(10).expand(2, -1), torch.tensor([2, 5])
     filled = farthest_point_fill(points.clone().requires_grad_(), indices, given)
     assert torch.equal(filled, farthest_point_fill(points, indices, given))

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from scipy.spatial import cKDTree
+from torch.testing import assert_close
 
 from mops_lightning.errors import UserError
 from mops_lightning.ops import compiled
@@ -26,7 +27,7 @@ def check_against_double_loop(n, dtype, rng):
     expected_distances, expected_indices = plain_nearest(queries, points)
     assert distances.dtype == dtype
     assert torch.equal(indices, expected_indices)
-    torch.testing.assert_close(distances, expected_distances)
+    assert_close(distances, expected_distances)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -50,22 +51,22 @@ def gradients(search_, queries, points, weights):
     return [leaf.grad for leaf in leaves]
 
 
-def test_nearest_gradients_equal_double_loop(rng):
-    queries = torch.randn(2, 9, 3, dtype=torch.float64, generator=rng)
-    points = torch.randn(2, 9, 3, dtype=torch.float64, generator=rng)
-    weights = torch.randn(2, 9, generator=rng)
+def test_nearest_gradients_equal_double_loop(randn):
+    queries = randn(2, 9, 3, dtype=torch.float64)
+    points = randn(2, 9, 3, dtype=torch.float64)
+    weights = randn(2, 9)
 
     of_nearest = gradients(nearest, queries, points, weights)
 
     of_plain = gradients(plain_nearest, queries, points, weights)
-    torch.testing.assert_close(of_nearest, of_plain)
+    assert_close(of_nearest, of_plain)
 
 
 @pytest.mark.usefixtures("without_compiled_loops")
 @pytest.mark.parametrize("block", [1, 100, 1000, 1500])
-def test_nearest_block_size_changes_nothing(block, rng, monkeypatch):
-    queries = torch.randn(3, 11, 3, generator=rng)
-    points = torch.randn(3, 40, 3, generator=rng)
+def test_nearest_block_size_changes_nothing(block, randn, monkeypatch):
+    queries = randn(3, 11, 3)
+    points = randn(3, 40, 3)
     whole_distances, whole_indices = nearest(queries, points)
     monkeypatch.setitem(search.BLOCK, "cpu", block)
 
@@ -77,10 +78,10 @@ def test_nearest_block_size_changes_nothing(block, rng, monkeypatch):
 
 @pytest.mark.parametrize("offset", [0.0, 30.0])
 @pytest.mark.parametrize("cloud", [0, 1])
-def test_nearest_far_from_origin_has_no_cancellation(cloud, offset, rng):
+def test_nearest_far_from_origin_has_no_cancellation(cloud, offset, randn, rand):
     """Close points far from the origin, where |a|² + |b|² − 2⟨a, b⟩ in float32 goes wrong."""
-    points = offset + 0.01 * torch.rand(2, 1500, 3, generator=rng)
-    noise = 1e-4 * torch.randn(2, 400, 3, generator=rng)
+    points = offset + 0.01 * rand(2, 1500, 3)
+    noise = 1e-4 * randn(2, 400, 3)
     queries = points[:, :400] + noise
 
     distances, indices = nearest(queries, points)
@@ -90,14 +91,14 @@ def test_nearest_far_from_origin_has_no_cancellation(cloud, offset, rng):
     smallest, _ = cKDTree(exact_points.numpy()).query(exact_queries.numpy())
     to_chosen = exact_queries - exact_points[indices[cloud]]
     exact = to_chosen.norm(dim=1)
-    torch.testing.assert_close(exact, torch.from_numpy(smallest), rtol=1e-6, atol=0)
+    assert_close(exact, torch.from_numpy(smallest), rtol=1e-6, atol=0)
     found = distances[cloud].double().sqrt()
-    torch.testing.assert_close(found, exact, rtol=1e-5, atol=0)
+    assert_close(found, exact, rtol=1e-5, atol=0)
 
 
 @pytest.mark.parametrize("value", [float("inf"), -float("inf"), float("nan")])
-def test_nearest_of_query_that_is_not_finite_is_a_row(value, rng):
-    points = torch.randn(1, 33, 3, generator=rng)
+def test_nearest_of_query_that_is_not_finite_is_a_row(value, randn):
+    points = randn(1, 33, 3)
     queries = points[:, :5] + 0.01
     queries[0, 2] = value
     finite = [0, 1, 3, 4]
@@ -126,9 +127,9 @@ def test_nearest_of_ties_is_lowest_index(query, row):
     assert indices.item() == row
 
 
-def test_nearest_half_precision_compares_in_float32(rng):
-    points = torch.randn(1, 50, 3, generator=rng).half()
-    queries = torch.randn(1, 20, 3, generator=rng).half()
+def test_nearest_half_precision_compares_in_float32(randn):
+    points = randn(1, 50, 3).half()
+    queries = randn(1, 20, 3).half()
 
     distances, indices = nearest(queries, points)
 
@@ -157,16 +158,16 @@ def test_k_nearest_shape_mismatch_raises(queries, points):
 
 
 @pytest.mark.parametrize("k", [1, 4, 30])
-def test_k_nearest_equals_sorted_distances(k, rng):
-    queries = torch.randn(2, 8, 3, dtype=torch.float64, generator=rng)
-    points = torch.randn(2, 30, 3, dtype=torch.float64, generator=rng)
+def test_k_nearest_equals_sorted_distances(k, randn):
+    queries = randn(2, 8, 3, dtype=torch.float64)
+    points = randn(2, 30, 3, dtype=torch.float64)
 
     distances, indices = k_nearest(queries, points, k)
 
     squared = torch.cdist(queries, points).square()
     in_order, rows = squared.sort(2)
     assert torch.equal(indices, rows[..., :k])
-    torch.testing.assert_close(distances, in_order[..., :k])
+    assert_close(distances, in_order[..., :k])
 
 
 @pytest.mark.parametrize("k", [0, 6])
@@ -186,15 +187,15 @@ def plain_chamfer(points, others):
 
 
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (1, 7), (40, 25), (300, 900)])
-def test_chamfer_equals_plain_form(n, m, rng):
-    points = torch.randn(3, n, 3, dtype=torch.float64, generator=rng, requires_grad=True)
-    others = torch.randn(3, m, 3, dtype=torch.float64, generator=rng, requires_grad=True)
+def test_chamfer_equals_plain_form(n, m, randn):
+    points = randn(3, n, 3, dtype=torch.float64, requires_grad=True)
+    others = randn(3, m, 3, dtype=torch.float64, requires_grad=True)
     inputs = [points, others]
 
     distance = chamfer_distance(points, others)
 
     expected = plain_chamfer(points, others)
-    torch.testing.assert_close(distance, expected)
+    assert_close(distance, expected)
     gradients = torch.autograd.grad(distance.sum(), inputs)
     expected_gradients = torch.autograd.grad(expected.sum(), inputs)
-    torch.testing.assert_close(gradients, expected_gradients)
+    assert_close(gradients, expected_gradients)

@@ -1,12 +1,13 @@
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
 from mops_lightning.ops.points import UnitSphere, gather_points, normalize_unit_sphere
 
 
-def test_gather_points_equals_double_loop(rng):
-    points = torch.randn(2, 7, 4, dtype=torch.float64, generator=rng)
+def test_gather_points_equals_double_loop(rng, randn):
+    points = randn(2, 7, 4, dtype=torch.float64)
     indices = torch.randint(7, (2, 5), generator=rng)
 
     gathered = gather_points(points, indices)
@@ -16,8 +17,8 @@ def test_gather_points_equals_double_loop(rng):
             assert torch.equal(gathered[b, j], points[b, indices[b, j]])
 
 
-def test_gather_points_of_nested_indices_equals_that_of_flat_ones(rng):
-    points = torch.randn(2, 7, 4, dtype=torch.float64, generator=rng)
+def test_gather_points_of_nested_indices_equals_that_of_flat_ones(rng, randn):
+    points = randn(2, 7, 4, dtype=torch.float64)
     indices = torch.randint(7, (2, 2, 2), generator=rng)
 
     gathered = gather_points(points, indices)
@@ -26,8 +27,8 @@ def test_gather_points_of_nested_indices_equals_that_of_flat_ones(rng):
     assert torch.equal(gathered, flat.unflatten(1, (2, 2)))
 
 
-def test_gather_points_has_gradients(rng):
-    points = torch.randn(2, 7, 4, dtype=torch.float64, generator=rng, requires_grad=True)
+def test_gather_points_has_gradients(rng, randn):
+    points = randn(2, 7, 4, dtype=torch.float64, requires_grad=True)
     indices = torch.randint(7, (2, 5), generator=rng)
 
     def gathered(points):
@@ -37,20 +38,20 @@ def test_gather_points_has_gradients(rng):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_normalize_centres_and_scales(dtype, rng):
-    points = 5 + 3 * torch.randn(4, 20, 3, dtype=dtype, generator=rng)
+def test_normalize_centres_and_scales(dtype, randn):
+    points = 5 + 3 * randn(4, 20, 3, dtype=dtype)
 
     result = normalize_unit_sphere(points)
 
     assert result.dtype == dtype
     assert result.mean(1).abs().max() < 1e-6
     radii = result.norm(dim=2).amax(1)
-    torch.testing.assert_close(radii, torch.ones(4, dtype=dtype))
+    assert_close(radii, torch.ones(4, dtype=dtype))
     edges = points[:, 1:] - points[:, :1]
     scaled_edges = result[:, 1:] - result[:, :1]
     ratios = edges / scaled_edges
     of_cloud = ratios[:, :1, :1].expand_as(ratios)
-    torch.testing.assert_close(ratios, of_cloud, rtol=1e-3, atol=0)
+    assert_close(ratios, of_cloud, rtol=1e-3, atol=0)
 
 
 def test_normalize_of_coincident_points_is_zero():

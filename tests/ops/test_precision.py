@@ -3,6 +3,7 @@
 import pytest
 import torch
 from torch.nn import functional as F
+from torch.testing import assert_close
 
 from mops_lightning.nets.foldingnet import MFoldingNet
 from mops_lightning.nets.max_pool import PLAIN_MAX_POINTS, PointMaxPool
@@ -27,16 +28,16 @@ def seen_dtypes(module, call):
     return seen
 
 
-def test_mops_net_first_layer_is_float32(rng):
-    points = torch.randn(2, 50, 3, generator=rng)
+def test_mops_net_first_layer_is_float32(randn):
+    points = randn(2, 50, 3)
     net = MOPSNet(8)
     seen = seen_dtypes(net, lambda: mixed(net, points))
     assert seen.pop("features.mlp.layers.0") == torch.float32
     assert set(seen.values()) == {torch.bfloat16}
 
 
-def test_full_precision_disables_autocast(rng):
-    points = torch.randn(2, 50, 3, generator=rng)
+def test_full_precision_disables_autocast(randn):
+    points = randn(2, 50, 3)
     net = MOPSNet(8).eval()
     with torch.no_grad():
         expected = net(points).points
@@ -45,8 +46,8 @@ def test_full_precision_disables_autocast(rng):
 
 
 @pytest.mark.parametrize("training", [True, False])
-def test_mops_net_sampling_matrix_is_float32(training, rng):
-    points = F.normalize(torch.randn(4, 200, 3, generator=rng), dim=2)
+def test_mops_net_sampling_matrix_is_float32(training, randn):
+    points = F.normalize(randn(4, 200, 3), dim=2)
     net = MOPSNet(16).train(training)
     in_single = net(points).points
 
@@ -56,8 +57,8 @@ def test_mops_net_sampling_matrix_is_float32(training, rng):
     assert output.points.dtype == torch.float32
     assert output.matrix.keys.dtype == torch.float32
     assert dense.dtype == torch.float32
-    torch.testing.assert_close(dense.sum(1), torch.ones(4, 16))
-    torch.testing.assert_close(dense.mT @ points, output.points)
+    assert_close(dense.sum(1), torch.ones(4, 16))
+    assert_close(dense.mT @ points, output.points)
     error = (output.points - in_single).abs().max()
     assert 0 < error < 0.02
 
@@ -76,17 +77,17 @@ def pooled_with_gradients(pool, features, direction):
 
 @pytest.mark.parametrize("n", [PLAIN_MAX_POINTS, 100])
 @pytest.mark.parametrize("norm", [True, False])
-def test_max_pool_half_precision_is_close_with_its_gradients(n, norm, rng):
+def test_max_pool_half_precision_is_close_with_its_gradients(n, norm, rng, randn):
     # Small whole numbers: their products are exact in half precision, so the same points win.
     features = torch.randint(-2, 3, (3, n, 16), generator=rng).float()
     pool = PointMaxPool(16, 64, norm)
     pool.linear.weight.data = torch.randint(-3, 4, (64, 16), generator=rng).float()
-    direction = torch.randn(3, 64, generator=rng)
+    direction = randn(3, 64)
 
     in_single = pooled_with_gradients(pool, features, direction)
     in_half = pooled_with_gradients(pool, features.bfloat16(), direction)
 
-    torch.testing.assert_close(in_half, in_single, rtol=0.02, atol=0.02)
+    assert_close(in_half, in_single, rtol=0.02, atol=0.02)
 
 
 def output_and_gradients(net, arguments):
@@ -106,14 +107,14 @@ def output_and_gradients(net, arguments):
     [PCRNet, lambda: MFoldingNet(64, 4, 64), lambda: MFoldingNet(64, 1, 64)],
     ids=["pcrnet", "mfoldingnet", "foldingnet"],
 )
-def test_nets_under_plain_autocast_are_close(make, rng):
+def test_nets_under_plain_autocast_are_close(make, randn):
     net = make()
-    points = torch.randn(4, 60, 3, generator=rng)
+    points = randn(4, 60, 3)
     arguments = (points, points + 0.1) if isinstance(net, PCRNet) else (points,)
     expected, expected_gradients = output_and_gradients(net, arguments)
 
     with torch.autocast("cpu", torch.bfloat16):
         output, gradients = output_and_gradients(net, arguments)
 
-    torch.testing.assert_close(output, expected, rtol=0.05, atol=0.05)
+    assert_close(output, expected, rtol=0.05, atol=0.05)
     assert F.cosine_similarity(gradients, expected_gradients, dim=0) > 0.9

@@ -5,6 +5,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
 from mops_lightning.errors import UserError
 from mops_lightning.ops.propagation import PropagationMap, propagate, propagation_map
@@ -27,32 +28,32 @@ def plain_map(points, sampled, k):
 
 @pytest.mark.parametrize("k", [1, 3])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_map_has_nearest_rows_and_inverse_square_weights(k, dtype, rng):
-    points = torch.rand(200, 3, generator=rng)
-    sampled = torch.rand(30, 3, generator=rng)
+def test_map_has_nearest_rows_and_inverse_square_weights(k, dtype, rand):
+    points = rand(200, 3)
+    sampled = rand(30, 3)
     rows, weights = plain_map(points, sampled, k)
 
     made = propagation_map(points.to(dtype), sampled.to(dtype), k)
 
     assert torch.equal(made.rows, rows)
-    torch.testing.assert_close(made.weights, weights.to(dtype), rtol=1e-4, atol=1e-6)
+    assert_close(made.weights, weights.to(dtype), rtol=1e-4, atol=1e-6)
     assert made.m == 30
 
 
 @pytest.mark.parametrize("k", [1, 5])
-def test_sampled_points_keep_their_values(k, rng):
-    points = torch.rand(80, 3, generator=rng)
+def test_sampled_points_keep_their_values(k, rng, rand):
+    points = rand(80, 3)
     chosen = torch.randperm(80, generator=rng)[:20]
-    scores = torch.rand(20, 4, generator=rng)
+    scores = rand(20, 4)
 
     carried = propagate(scores, propagation_map(points, points[chosen], k))
 
     assert torch.equal(carried[chosen], scores)
 
 
-def test_ragged_clouds_equal_clouds_one_by_one(rng):
-    first = torch.rand(40, 3, generator=rng)
-    second = torch.rand(25, 3, generator=rng)
+def test_ragged_clouds_equal_clouds_one_by_one(rng, rand):
+    first = rand(40, 3)
+    second = rand(25, 3)
     labels = torch.randint(9, (14,), generator=rng)
     points = torch.cat([first, second])
     batch = torch.arange(2).repeat_interleave(torch.tensor([40, 25]))
@@ -67,10 +68,10 @@ def test_ragged_clouds_equal_clouds_one_by_one(rng):
 
 
 @pytest.mark.parametrize("cloud", [0, 1])
-def test_batch_equals_clouds_one_by_one(cloud, rng):
-    points = torch.rand(2, 20, 3, generator=rng)
-    samples = torch.rand(2, 6, 3, generator=rng)
-    values = torch.rand(2, 6, 5, generator=rng)
+def test_batch_equals_clouds_one_by_one(cloud, rand):
+    points = rand(2, 20, 3)
+    samples = rand(2, 6, 3)
+    values = rand(2, 6, 5)
 
     carried = propagate(values, propagation_map(points, samples, 2))
 
@@ -81,9 +82,9 @@ def test_batch_equals_clouds_one_by_one(cloud, rng):
 
 @pytest.mark.parametrize("kind", LABELS)
 @pytest.mark.parametrize("k", [1, 4])
-def test_labels_stay_exact(kind, k, rng):
-    points = torch.rand(90, 3, generator=rng).numpy()
-    sampled = torch.rand(12, 3, generator=rng).numpy()
+def test_labels_stay_exact(kind, k, rand):
+    points = rand(90, 3).numpy()
+    sampled = rand(12, 3).numpy()
     number_of_labels = 2 if kind is np.bool_ else 5
     labels = (np.arange(12) % number_of_labels).astype(kind)
     made = propagation_map(points, sampled, k)
@@ -126,10 +127,10 @@ def test_vote_that_is_tied_is_won_by_the_nearer_point_and_among_equals_by_the_lo
     assert voted_by_the_nearer.tolist() == [3]
 
 
-def test_gradients_flow_to_features(rng):
-    points = torch.rand(9, 3, generator=rng, dtype=torch.float64)
-    sampled = torch.rand(6, 3, generator=rng, dtype=torch.float64)
-    features = torch.rand(6, 2, generator=rng, dtype=torch.float64, requires_grad=True)
+def test_gradients_flow_to_features(rand):
+    points = rand(9, 3, dtype=torch.float64)
+    sampled = rand(6, 3, dtype=torch.float64)
+    features = rand(6, 2, dtype=torch.float64, requires_grad=True)
     made = propagation_map(points, sampled, 3)
 
     def carried(features):

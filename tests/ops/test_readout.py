@@ -10,9 +10,9 @@ from tests.support.plain import plain_farthest
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_match_equals_kd_tree(dtype, rng):
-    points = torch.randn(4, 700, 3, dtype=dtype, generator=rng)
-    generated = 0.7 * torch.randn(4, 90, 3, dtype=dtype, generator=rng)
+def test_match_equals_kd_tree(dtype, randn):
+    points = randn(4, 700, 3, dtype=dtype)
+    generated = 0.7 * randn(4, 90, 3, dtype=dtype)
 
     matched = match(generated, points)
 
@@ -21,8 +21,8 @@ def test_match_equals_kd_tree(dtype, rng):
         assert rows.tolist() == expected.tolist()
 
 
-def test_match_has_no_gradients(rng):
-    points = torch.randn(1, 9, 3, generator=rng, requires_grad=True)
+def test_match_has_no_gradients(randn):
+    points = randn(1, 9, 3, requires_grad=True)
     assert not match(points, points).requires_grad
 
 
@@ -39,8 +39,8 @@ def plain_complete(indices, cloud):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_complete_equals_sequential_form(dtype, rng):
-    points = torch.randn(6, 50, 3, dtype=dtype, generator=rng)
+def test_complete_equals_sequential_form(dtype, rng, randn):
+    points = randn(6, 50, 3, dtype=dtype)
     indices = torch.randint(18, (6, 20), generator=rng)
     indices[0] = 7  # all matched to one point
     indices[1] = torch.randperm(50, generator=rng)[:20]  # nothing missing
@@ -53,10 +53,10 @@ def test_complete_equals_sequential_form(dtype, rng):
         assert rows.tolist() == plain_complete(matched, cloud)
 
 
-def test_complete_fills_up_by_weight(rng):
-    points = torch.randn(4, 50, 3, dtype=torch.float64, generator=rng)
+def test_complete_fills_up_by_weight(rng, randn, rand):
+    points = randn(4, 50, 3, dtype=torch.float64)
     indices = torch.randint(8, (4, 20), generator=rng)
-    weight = torch.rand(4, 50, generator=rng)
+    weight = rand(4, 50)
 
     completed = complete(indices, points, weight)
 

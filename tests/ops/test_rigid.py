@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from torch.testing import assert_close
 
 from mops_lightning.ops import rigid
 from mops_lightning.seeding import generator
@@ -31,7 +32,7 @@ def quaternions(rotation):
 def same_rotation(got, want, tolerance=1e-12):
     product = (got * want).sum(-1, keepdim=True)
     sign = torch.where(product < 0, -1.0, 1.0)
-    torch.testing.assert_close(got * sign, want, atol=tolerance, rtol=0)
+    assert_close(got * sign, want, atol=tolerance, rtol=0)
 
 
 def test_quaternion_to_matrix_equals_scipy():
@@ -40,7 +41,7 @@ def test_quaternion_to_matrix_equals_scipy():
     matrices = rigid.quaternion_to_matrix(quaternions(given))
 
     expected = torch.from_numpy(given.as_matrix())
-    torch.testing.assert_close(matrices, expected, atol=1e-12, rtol=0)
+    assert_close(matrices, expected, atol=1e-12, rtol=0)
 
 
 def test_multiply_equals_scipy():
@@ -77,9 +78,7 @@ def check_angle(first, second, dtype):
 
     expected = (first.inv() * second).magnitude()
     assert torch.isfinite(angle).all()
-    torch.testing.assert_close(
-        angle, torch.from_numpy(expected).to(dtype), atol=TOLERANCES[dtype], rtol=0
-    )
+    assert_close(angle, torch.from_numpy(expected).to(dtype), atol=TOLERANCES[dtype], rtol=0)
 
 
 @pytest.mark.parametrize("dtype", TOLERANCES)
@@ -105,35 +104,35 @@ def test_rotation_angle_takes_quaternions_of_any_sign_and_norm():
 
     angle = rigid.rotation_angle(-3 * first, second)
 
-    torch.testing.assert_close(angle, rigid.rotation_angle(first, second))
+    assert_close(angle, rigid.rotation_angle(first, second))
 
 
-def test_motion_after_another_moves_points_twice(rng):
-    points = torch.randn(5, 40, 3, generator=rng)
+def test_motion_after_another_moves_points_twice(randn):
+    points = randn(5, 40, 3)
     first = motion(1)
     second = motion(2)
 
     twice = second.after(first).apply(points)
 
     one_by_one = second.apply(first.apply(points))
-    torch.testing.assert_close(twice, one_by_one, atol=1e-5, rtol=0)
+    assert_close(twice, one_by_one, atol=1e-5, rtol=0)
 
 
-def test_identity_motion_keeps_points(rng):
-    points = torch.randn(5, 40, 3, generator=rng)
+def test_identity_motion_keeps_points(randn):
+    points = randn(5, 40, 3)
 
     moved = rigid.identity_motion(points).apply(points)
 
-    torch.testing.assert_close(moved, points)
+    assert_close(moved, points)
 
 
-def test_motion_keeps_distances(rng):
-    points = torch.randn(5, 40, 3, generator=rng)
+def test_motion_keeps_distances(randn):
+    points = randn(5, 40, 3)
 
     moved = motion(1).apply(points)
 
     distances = points.diff(dim=1).norm(dim=2)
-    torch.testing.assert_close(moved.diff(dim=1).norm(dim=2), distances)
+    assert_close(moved.diff(dim=1).norm(dim=2), distances)
 
 
 def test_random_motion_covers_its_translations():

@@ -1,5 +1,6 @@
 import pytest
 import torch
+from torch.testing import assert_close
 
 from mops_lightning.ops import attention, sampling_matrix
 from mops_lightning.ops.sampling_matrix import SamplingMatrix
@@ -43,13 +44,13 @@ def path(request, monkeypatch):
 
 def test_dense_equals_column_softmax():
     matrix, _ = random_matrix()
-    torch.testing.assert_close(matrix.dense(), plain_dense(matrix))
-    torch.testing.assert_close(matrix.dense().sum(1), torch.ones(2, 11, dtype=torch.float64))
+    assert_close(matrix.dense(), plain_dense(matrix))
+    assert_close(matrix.dense().sum(1), torch.ones(2, 11, dtype=torch.float64))
 
 
 def test_sample_equals_dense_product(path):
     matrix, points = random_matrix()
-    torch.testing.assert_close(matrix.sample(points), plain_dense(matrix).mT @ points)
+    assert_close(matrix.sample(points), plain_dense(matrix).mT @ points)
 
 
 def test_sample_is_streamed_above_a_number_of_entries(monkeypatch):
@@ -75,7 +76,7 @@ def test_sample_gradients_equal_dense(path):
 
     gradients = torch.autograd.grad((sampled * weight).sum(), inputs)
     expected = torch.autograd.grad((plain * weight).sum(), inputs)
-    torch.testing.assert_close(gradients, expected)
+    assert_close(gradients, expected)
 
 
 def test_sample_large_logits_do_not_overflow(path):
@@ -88,7 +89,7 @@ def test_sample_large_logits_do_not_overflow(path):
     logits = matrix.keys @ matrix.queries.T
     winners = logits.argmax(1)
     expected = torch.take_along_dim(points, winners[..., None], 1)
-    torch.testing.assert_close(sampled, expected, atol=1e-3, rtol=0)
+    assert_close(sampled, expected, atol=1e-3, rtol=0)
 
 
 def test_sample_float32_streamed_is_as_accurate_as_dense():
@@ -104,8 +105,8 @@ def test_sample_float32_streamed_is_as_accurate_as_dense():
     logits = exact.queries @ exact.keys[0].mT / exact.tau
     largest_logit = float(logits.abs().max())
     tolerance = largest_logit * torch.finfo(torch.float32).eps
-    torch.testing.assert_close(streamed.double(), expected, atol=tolerance, rtol=0)
-    torch.testing.assert_close(plain.double(), expected, atol=tolerance, rtol=0)
+    assert_close(streamed.double(), expected, atol=tolerance, rtol=0)
+    assert_close(plain.double(), expected, atol=tolerance, rtol=0)
     error_of_streamed = (streamed.double() - expected).abs().mean()
     error_of_plain = (plain.double() - expected).abs().mean()
     assert error_of_streamed <= 1.5 * error_of_plain
@@ -125,15 +126,15 @@ def test_sparse_drops_and_renormalises(path, threshold):
 
     sparse = matrix.sparse(threshold)
 
-    torch.testing.assert_close(sparse.to_dense(), expected)
+    assert_close(sparse.to_dense(), expected)
 
 
 def test_nonzero_counts_and_gram_equal_dense(path):
     matrix, _ = random_matrix()
     dense = plain_dense(matrix)
     counts = (dense >= 0.05).to(dense).sum(1)
-    torch.testing.assert_close(matrix.nonzero_counts(0.05), counts)
-    torch.testing.assert_close(matrix.gram(), dense.mT @ dense)
+    assert_close(matrix.nonzero_counts(0.05), counts)
+    assert_close(matrix.gram(), dense.mT @ dense)
 
 
 def summaries(matrix):
@@ -148,7 +149,7 @@ def test_summaries_under_autocast_are_unchanged():
         under_autocast = summaries(matrix)
 
     single = summaries(matrix)
-    torch.testing.assert_close(under_autocast, single, atol=0, rtol=0)
+    assert_close(under_autocast, single, atol=0, rtol=0)
 
 
 @pytest.fixture
@@ -171,11 +172,11 @@ def test_samples_with_queries_of_every_cloud_equal_those_of_single_clouds(path, 
 
     sampled = together.sample(points)
 
-    torch.testing.assert_close(sampled, expected)
+    assert_close(sampled, expected)
     weight = drawn_normal(torch.Generator().manual_seed(4), 2, 11, 3)
     gradient = torch.autograd.grad((sampled * weight).sum(), together.queries)
     expected_gradient = torch.autograd.grad((expected * weight).sum(), together.queries)
-    torch.testing.assert_close(gradient, expected_gradient)
+    assert_close(gradient, expected_gradient)
 
 
 def test_views_with_queries_of_every_cloud_equal_those_of_single_clouds(path, matrix_per_cloud):
@@ -184,12 +185,12 @@ def test_views_with_queries_of_every_cloud_equal_those_of_single_clouds(path, ma
     is_large = dense >= 0.05
     leftmost = together.leftmost(4)
 
-    torch.testing.assert_close(together.dense(), dense)
-    torch.testing.assert_close(together.sparse(0.0).to_dense(), dense)
-    torch.testing.assert_close(together.gram(), dense.mT @ dense)
-    torch.testing.assert_close(together.nonzero_counts(0.05), is_large.to(dense).sum(1))
-    torch.testing.assert_close(leftmost.dense(), dense[..., :4])
-    torch.testing.assert_close(together.first_cloud().dense(), dense[:1])
+    assert_close(together.dense(), dense)
+    assert_close(together.sparse(0.0).to_dense(), dense)
+    assert_close(together.gram(), dense.mT @ dense)
+    assert_close(together.nonzero_counts(0.05), is_large.to(dense).sum(1))
+    assert_close(leftmost.dense(), dense[..., :4])
+    assert_close(together.first_cloud().dense(), dense[:1])
     assert leftmost.m == 4
 
 
@@ -201,6 +202,6 @@ def test_leftmost_is_first_columns_and_first_cloud_has_all():
     leftmost = matrix.leftmost(4)
     first_cloud = matrix.first_cloud()
 
-    torch.testing.assert_close(leftmost.dense(), dense[:, :, :4])
-    torch.testing.assert_close(leftmost.sample(points), sampled[:, :4])
-    torch.testing.assert_close(first_cloud.dense(), dense[:1])
+    assert_close(leftmost.dense(), dense[:, :, :4])
+    assert_close(leftmost.sample(points), sampled[:, :4])
+    assert_close(first_cloud.dense(), dense[:1])

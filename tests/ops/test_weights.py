@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-import torch
 
 from mops_lightning.errors import UserError
 from mops_lightning.ops import weights
@@ -32,7 +31,7 @@ def test_curvature_equals_definition_for_every_point(monkeypatch):
         assert value == pytest.approx(values[0] / values.sum())
 
 
-def test_curvature_is_least_in_a_plane_and_for_equal_points(rng):
-    plane = torch.rand(60, 3, generator=rng).numpy() * [1, 1, 0]
+def test_curvature_is_least_in_a_plane_and_for_equal_points(rand):
+    plane = rand(60, 3).numpy() * [1, 1, 0]
     assert curvature(plane) == pytest.approx(np.full(60, LEAST))
     assert curvature(np.ones((5, 3))) == pytest.approx(np.full(5, LEAST))

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from mops_lightning import FMOPSNet, MOPSNet
 from mops_lightning.errors import UserError
@@ -59,10 +60,10 @@ def plain_dense(net, points, keys):
 
 @pytest.mark.parametrize("training", [True, False])
 @pytest.mark.parametrize("number", [20, 90])
-def test_anchors_equal_dense_softmax_of_distances(training, number, rng):
+def test_anchors_equal_dense_softmax_of_distances(training, number, randn):
     net = small(moved=True, tau_min=0.3).double().train(training)
-    points = torch.randn(3, number, 3, dtype=torch.float64, generator=rng, requires_grad=True)
-    direction = torch.randn(3, 6, 3, dtype=torch.float64, generator=rng)
+    points = randn(3, number, 3, dtype=torch.float64, requires_grad=True)
+    direction = randn(3, 6, 3, dtype=torch.float64)
 
     output = net(points)
 
@@ -70,21 +71,21 @@ def test_anchors_equal_dense_softmax_of_distances(training, number, rng):
     keys = output.matrix.keys[..., :10]
     dense = plain_dense(net, points, keys)
     expected = dense.mT @ points
-    torch.testing.assert_close(output.matrix.dense(), dense)
-    torch.testing.assert_close(output.points, expected)
+    assert_close(output.matrix.dense(), dense)
+    assert_close(output.points, expected)
     parameters = list(net.queries.parameters())
     along = (output.points * direction).sum()
     gradients = torch.autograd.grad(along, parameters, retain_graph=True)
     expected_gradients = torch.autograd.grad((expected * direction).sum(), parameters)
     for gradient in expected_gradients:
         assert gradient.abs().max() > 0
-    torch.testing.assert_close(gradients, expected_gradients)
+    assert_close(gradients, expected_gradients)
 
 
 @pytest.mark.parametrize("m", [50, 200])
 @pytest.mark.parametrize("width", [0.3, 0.8])
-def test_untrained_anchors_are_near_farthest_points(width, m, rng):
-    directions = torch.randn(3, 1000, 3, generator=rng)
+def test_untrained_anchors_are_near_farthest_points(width, m, randn):
+    directions = randn(3, 1000, 3)
     points = torch.nn.functional.normalize(directions, dim=2)
     net = small(m=m, tau_min=0.5, anchor_width=width).eval()
 
@@ -98,8 +99,8 @@ def test_untrained_anchors_are_near_farthest_points(width, m, rng):
     assert apart.max() > width * between.mean() / 20
 
 
-def test_anchors_are_nested_in_size_and_weights(rng):
-    points = torch.randn(2, 80, 3, generator=rng)
+def test_anchors_are_nested_in_size_and_weights(randn):
+    points = randn(2, 80, 3)
     net = small(FMOPSNet, m=16, moved=True).eval()
 
     whole = net(points)
@@ -108,15 +109,15 @@ def test_anchors_are_nested_in_size_and_weights(rng):
     of_small_clouds = net(points[:, :7], 5)
 
     first = whole.first(5)
-    torch.testing.assert_close(few.points, whole.points[:, :5])
-    torch.testing.assert_close(few.matrix.dense(), whole.matrix.dense()[..., :5])
-    torch.testing.assert_close(first.matrix.gram(), few.matrix.gram())
+    assert_close(few.points, whole.points[:, :5])
+    assert_close(few.matrix.dense(), whole.matrix.dense()[..., :5])
+    assert_close(first.matrix.gram(), few.matrix.gram())
     assert of_small_clouds.points.shape == (2, 5, 3)
 
 
-def test_anchors_of_large_clouds_are_computed_in_blocks(rng, monkeypatch):
-    points = torch.randn(2, 60, 3, generator=rng).double()  # gradients of widths cancel in float32
-    direction = torch.randn(2, 6, 3, generator=rng).double()
+def test_anchors_of_large_clouds_are_computed_in_blocks(randn, monkeypatch):
+    points = randn(2, 60, 3).double()  # gradients of widths cancel in float32
+    direction = randn(2, 6, 3).double()
     net = small(moved=True).double()
     parameters = list(net.queries.parameters())
     whole = net(points).points
@@ -125,25 +126,25 @@ def test_anchors_of_large_clouds_are_computed_in_blocks(rng, monkeypatch):
 
     by_blocks = net(points).points
 
-    torch.testing.assert_close(by_blocks, whole, atol=1e-12, rtol=0)
+    assert_close(by_blocks, whole, atol=1e-12, rtol=0)
     gradients = torch.autograd.grad((by_blocks * direction).sum(), parameters)
-    torch.testing.assert_close(gradients, expected, atol=1e-9, rtol=1e-9)
+    assert_close(gradients, expected, atol=1e-9, rtol=1e-9)
 
 
-def test_anchors_with_fused_layers_equal_layers(rng):
+def test_anchors_with_fused_layers_equal_layers(randn):
     net = small(moved=True)
     for _ in range(3):
-        net(torch.randn(4, 50, 3, generator=rng))
+        net(randn(4, 50, 3))
     net.eval()
-    points = torch.randn(2, 50, 3, generator=rng)
+    points = randn(2, 50, 3)
     with torch.no_grad():
         fast = net(points).points
-    torch.testing.assert_close(fast, net(points).points.detach(), atol=1e-5, rtol=1e-4)
+    assert_close(fast, net(points).points.detach(), atol=1e-5, rtol=1e-4)
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-def test_anchors_in_half_precision_keep_distances(dtype, rng):
-    points = torch.randn(2, 100, 3, generator=rng).to(dtype)
+def test_anchors_in_half_precision_keep_distances(dtype, randn):
+    points = randn(2, 100, 3).to(dtype)
     net = small(m=32).eval()
     net.queries.log_width.data.fill_(-2.0)
     in_single = net(points.float()).points
@@ -151,7 +152,7 @@ def test_anchors_in_half_precision_keep_distances(dtype, rng):
     in_half = net.to(dtype)(points).points
 
     assert in_half.dtype == dtype
-    torch.testing.assert_close(in_half.float(), in_single, atol=0.05, rtol=0)
+    assert_close(in_half.float(), in_single, atol=0.05, rtol=0)
 
 
 def test_anchors_warm_start_keeps_their_start():
@@ -165,11 +166,11 @@ def test_anchors_warm_start_keeps_their_start():
     assert torch.equal(net.queries.slots, larger.queries.slots[:6])
 
 
-def test_anchors_refuse_chunks(rng):
+def test_anchors_refuse_chunks(randn):
     net = small().eval()
 
     with pytest.raises(UserError, match=r"needs all points .* chunks.*without anchors=fps"):
-        stream_sample(net, lambda: torch.randn(50, 3, generator=rng).split(20))
+        stream_sample(net, lambda: randn(50, 3).split(20))
 
 
 def median_width(net, points):
@@ -181,8 +182,8 @@ def median_width(net, points):
     return variances.sqrt().median()
 
 
-def test_untrained_columns_are_as_wide_as_the_spacing_of_their_points(rng):
-    plane = torch.rand(1, 4000, 3, generator=rng) * torch.tensor([1.0, 1.0, 0.0])
+def test_untrained_columns_are_as_wide_as_the_spacing_of_their_points(rand):
+    plane = rand(1, 4000, 3) * torch.tensor([1.0, 1.0, 0.0])
     of_16 = small(m=16, anchor_width=0.5, tau_min=1.0).eval()
     of_64 = small(m=64, anchor_width=0.5, tau_min=1.0).eval()
 

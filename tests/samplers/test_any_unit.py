@@ -26,8 +26,8 @@ def sampler_of(method, m, seed):
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("number", [50, 600])
-def test_rows_are_those_of_the_cloud_in_the_unit_sphere(method, number, rng):
-    points = torch.randn(3, number, 3, generator=rng) * 40 + 7
+def test_rows_are_those_of_the_cloud_in_the_unit_sphere(method, number, randn):
+    points = randn(3, number, 3) * 40 + 7
     sampler = sampler_of(method, 20, 3)
 
     _, rows = sampler.downsample(points)
@@ -47,8 +47,8 @@ def test_points_do_not_depend_on_the_order_of_the_input(method, kind, rng):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_points_of_a_map_are_chosen_alike_in_python_and_by_the_command_line(method, rng):
-    points = torch.rand(500, 3, generator=rng, dtype=torch.float64) * 90
+def test_points_of_a_map_are_chosen_alike_in_python_and_by_the_command_line(method, rand):
+    points = rand(500, 3, dtype=torch.float64) * 90
     points += torch.tensor([637_012.25, 5_851_993.5, 411.0], dtype=torch.float64)
 
     _, rows = downsample(points, 30, method, seed=0 if method == "serial" else 8)
@@ -99,13 +99,13 @@ def test_coordinates_that_are_not_finite_are_refused(method, number):
         downsample(points, 8, method)
 
 
-def test_samplers_of_nets_get_the_unit_sphere(rng):
+def test_samplers_of_nets_get_the_unit_sphere(randn):
     class FirstPoints(Sampler):
         def sample(self, points, m):
             assert points.norm(dim=2).amax() <= 1 + 1e-6
             return RandomSampler(m)(points)
 
-    points = torch.randn(60, 3, generator=rng) * 1000
+    points = randn(60, 3) * 1000
 
     _, rows = FirstPoints(6).downsample(points)
 

@@ -43,8 +43,8 @@ def test_by_budget_takes_farthest_points_for_numbers_that_a_sampler_does_not_ret
     assert of_flexible.sampler_for(10) is FPS
 
 
-def test_by_budget_returns_the_completed_set_of_a_trained_sampler(rng):
-    points = torch.rand(2, 64, 3, generator=rng)
+def test_by_budget_returns_the_completed_set_of_a_trained_sampler(rand):
+    points = rand(2, 64, 3)
     trained = FMOPSNet(m_max=16).eval()
     sampler = ByBudget([8, 32], [1, 0], [FPS, trained]).eval()
 
@@ -59,8 +59,8 @@ def test_by_budget_returns_the_completed_set_of_a_trained_sampler(rng):
     assert torch.equal(larger[0], points.gather(1, larger[1][..., None].expand(-1, -1, 3)))
 
 
-def test_by_budget_shows_channels_to_the_samplers_that_take_them(rng):
-    points = torch.rand(2, 64, 5, generator=rng)
+def test_by_budget_shows_channels_to_the_samplers_that_take_them(rand):
+    points = rand(2, 64, 5)
     trained = FMOPSNet(m_max=16, point_channels=2).eval()
     sampler = ByBudget([8, 16], [1, 0], [FPS, trained], point_channels=2).eval()
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from torch.nn import functional as F
+from torch.testing import assert_close
 
 from mops_lightning import (
     CriticalSampler,
@@ -65,11 +66,11 @@ LEARNED = {
 
 
 @pytest.fixture
-def clouds(rng):
+def clouds(randn):
     """Points with a scaled intensity and normals."""
-    places = torch.randn(B, N, 3, generator=rng)
-    intensity = torch.randn(B, N, 1, generator=rng)
-    normals = F.normalize(torch.randn(B, N, 3, generator=rng), dim=2)
+    places = randn(B, N, 3)
+    intensity = randn(B, N, 1)
+    normals = F.normalize(randn(B, N, 3), dim=2)
     return torch.cat([places, intensity, normals], 2)
 
 
@@ -107,7 +108,7 @@ def test_learned_sampler_returns_channels_with_normals_of_length_one(name, train
     output = sampler(clouds)
 
     assert output.points.shape == (B, M, 7)
-    torch.testing.assert_close(output.points[..., 4:].norm(dim=2), torch.ones(B, M))
+    assert_close(output.points[..., 4:].norm(dim=2), torch.ones(B, M))
     if output.soft_projected is not None:
         assert output.soft_projected.shape == (B, M, 7)
 
@@ -133,8 +134,8 @@ def test_generated_points_are_the_transposed_matrix_times_points_and_channels(na
 
     means = output.matrix.dense().mT @ clouds
     normals = F.normalize(means[..., 4:], dim=2)
-    torch.testing.assert_close(output.points[..., :4], means[..., :4])
-    torch.testing.assert_close(output.points[..., 4:], normals)
+    assert_close(output.points[..., :4], means[..., :4])
+    assert_close(output.points[..., 4:], normals)
 
 
 @pytest.mark.parametrize("name", ["snet", "samplenet", "progressive"])
@@ -154,7 +155,7 @@ def test_subset_loss_is_between_coordinates(clouds):
     output = sampler(clouds)
 
     expected = subset_losses(clouds[..., :3].contiguous(), output.points[..., :3].contiguous(), [M])
-    torch.testing.assert_close(output.losses["subset"], sampler.alpha * expected[M])
+    assert_close(output.losses["subset"], sampler.alpha * expected[M])
 
 
 @pytest.mark.parametrize("name", LEARNED)
@@ -198,7 +199,7 @@ def test_streamed_sample_equals_the_whole(clouds):
 
     streamed = stream_sample(sampler, lambda: iter(clouds[0].split(15)))
 
-    torch.testing.assert_close(streamed, sampler(clouds).points[0])
+    assert_close(streamed, sampler(clouds).points[0])
 
 
 def test_downsample_without_the_channels_names_them(clouds):
@@ -271,8 +272,8 @@ def test_downsample_maps_generated_channels_back(clouds, cloud_in_own_units):
     selected: Any = sampler.select("generated", normalised(clouds[0])[None], M)
     (seen,), _ = selected
     intensity = 100 + 50 * seen[:, 3]
-    torch.testing.assert_close(points[:, 3], intensity.double())
-    torch.testing.assert_close(points[:, 4:], seen[:, 4:].double())
+    assert_close(points[:, 3], intensity.double())
+    assert_close(points[:, 4:], seen[:, 4:].double())
 
 
 def normalised(cloud):

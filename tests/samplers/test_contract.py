@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from mops_lightning import GumbelSampler, MOPSNet, Sampler, SNet
 from mops_lightning.errors import UserError
@@ -25,8 +26,8 @@ def make(request):
 
 
 @pytest.fixture
-def clouds(rng):
-    return torch.randn(B, N, 3, generator=rng)
+def clouds(randn):
+    return randn(B, N, 3)
 
 
 def lattice(rng):
@@ -60,9 +61,9 @@ def test_autocast_keeps_dtype(make, training, clouds):
         assert sampler(clouds.bfloat16()).points.dtype == torch.bfloat16
     assert half.points.dtype == torch.float32
     if half.matrix is not None:
-        torch.testing.assert_close(half.matrix.dense().mT @ clouds, half.points)
+        assert_close(half.matrix.dense().mT @ clouds, half.points)
     if isinstance(sampler, MOPSNet | SNet):  # others choose, and may choose another point
-        torch.testing.assert_close(half.points, sampler(clouds).points, atol=0.05, rtol=0.05)
+        assert_close(half.points, sampler(clouds).points, atol=0.05, rtol=0.05)
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -97,9 +98,9 @@ def test_several_sizes_equal_single_sizes_and_are_nested_where_declared(make, cl
     if sampler.flexible:
         whole = sampler(clouds).points
         for m, output in sampler.sample_sizes(clouds, (M, 1, M - 3)).items():
-            torch.testing.assert_close(output.points, sampler(clouds, m).points)
+            assert_close(output.points, sampler(clouds, m).points)
             if sampler.nested:
-                torch.testing.assert_close(output.points, whole[:, :m])
+                assert_close(output.points, whole[:, :m])
 
 
 def test_sampler_without_sample_raises(clouds):
@@ -134,7 +135,7 @@ def test_other_size_needs_flexible_sampler(make, clouds):
     for m in (1, M - 3, M):
         assert sampler(clouds, m).points.shape == (B, m, 3)
         assert sampler.sample(clouds, m).points.shape == (B, m, 3)
-        torch.testing.assert_close(sampler(clouds, m).points, make(m)(clouds).points)
+        assert_close(sampler(clouds, m).points, make(m)(clouds).points)
 
 
 @pytest.mark.parametrize(
@@ -163,7 +164,7 @@ def test_sample_is_permutation_invariant(make, clouds, cloud, rng):
     permuted = points[:, torch.randperm(N, generator=rng)]
     first, second = sampler(points).points, sampler(permuted).points
     if sampler.learned:
-        torch.testing.assert_close(first, second, atol=1e-5, rtol=0)
+        assert_close(first, second, atol=1e-5, rtol=0)
     else:
         assert as_sets(first) == as_sets(second)
 
@@ -177,7 +178,7 @@ def test_sample_is_independent_of_batch(make, clouds, cloud, rng):
     for b in range(B):
         alone = sampler(points[b : b + 1])
         if sampler.learned:
-            torch.testing.assert_close(alone.points[0], together.points[b], atol=1e-5, rtol=0)
+            assert_close(alone.points[0], together.points[b], atol=1e-5, rtol=0)
         else:
             assert torch.equal(alone.points[0], together.points[b])
         if alone.indices is not None:
@@ -213,9 +214,9 @@ def test_size_of_all_points_returns_all(make, clouds):
 
 
 @pytest.mark.parametrize("distinct", [1, 3])
-def test_coincident_points_give_valid_sample(make, distinct, rng):
+def test_coincident_points_give_valid_sample(make, distinct, randn):
     place = torch.arange(N) % distinct
-    points = torch.randn(B, distinct, 3, generator=rng)[:, place]
+    points = randn(B, distinct, 3)[:, place]
     sampler = make()
     output = sampler(points)
     assert torch.isfinite(output.points).all()
@@ -227,8 +228,8 @@ def test_coincident_points_give_valid_sample(make, distinct, rng):
         assert all(len(set(row)) == M for row in output.indices.tolist())
 
 
-def test_gradients_are_correct(make, rng):
-    points = torch.randn(1, 9, 3, dtype=torch.float64, generator=rng, requires_grad=True)
+def test_gradients_are_correct(make, randn):
+    points = randn(1, 9, 3, dtype=torch.float64, requires_grad=True)
     sampler = make(m=3, dtype=torch.float64)
 
     def sampled(points):
@@ -264,8 +265,8 @@ def test_compiles_to_one_graph(name, training, clouds):
     with torch.no_grad():
         want = sampler(clouds)
         got = torch.compile(sampler, backend="eager", fullgraph=True)(clouds)
-    torch.testing.assert_close(got.points, want.points)
-    torch.testing.assert_close(got.losses, want.losses)
+    assert_close(got.points, want.points)
+    assert_close(got.losses, want.losses)
 
 
 class Generated(torch.nn.Module):
@@ -284,4 +285,4 @@ def test_exported_program_generates_the_same_points(name, clouds, tmp_path):
     with torch.no_grad():
         torch.export.save(torch.export.export(Generated(sampler), (clouds,)), path)
         got = torch.export.load(path).module()(clouds)
-        torch.testing.assert_close(got, sampler(clouds).points)
+        assert_close(got, sampler(clouds).points)

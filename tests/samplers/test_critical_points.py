@@ -3,6 +3,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from mops_lightning.errors import UserError
 from mops_lightning.nets.pointnet import PointNetVanilla
@@ -21,9 +22,9 @@ def plain_contributions(features):
 
 
 @torch.no_grad()
-def test_critical_equals_plain_ranking(rng):
+def test_critical_equals_plain_ranking(randn):
     net = PointNetVanilla(3).eval()
-    points = torch.randn(3, 60, 3, generator=rng)
+    points = randn(3, 60, 3)
 
     indices = CriticalSampler(20, net)(points).indices
 
@@ -39,21 +40,21 @@ def modes_of(net):
     return [module.training for module in net.modules()]
 
 
-def test_critical_leaves_net_as_it_is(rng):
+def test_critical_leaves_net_as_it_is(randn):
     net: Any = PointNetVanilla(3)
     net.pool.eval()
     modes = modes_of(net)
     before = copy.deepcopy(net.state_dict())
     sampler = CriticalSampler(4, net)
 
-    sampler(torch.randn(2, 40, 3, generator=rng))
+    sampler(randn(2, 40, 3))
 
     assert modes_of(net) == modes
-    torch.testing.assert_close(net.state_dict(), before, atol=0, rtol=0)
+    assert_close(net.state_dict(), before, atol=0, rtol=0)
 
 
-def test_critical_large_batch_equals_small_ones(rng, monkeypatch):
-    net, points = PointNetVanilla(3), torch.randn(5, 40, 3, generator=rng)
+def test_critical_large_batch_equals_small_ones(randn, monkeypatch):
+    net, points = PointNetVanilla(3), randn(5, 40, 3)
     whole = CriticalSampler(6, net)(points).indices
     monkeypatch.setattr("mops_lightning.samplers.critical_points.BATCH_POINTS", 80)
     assert torch.equal(CriticalSampler(6, net)(points).indices, whole)
@@ -71,9 +72,9 @@ def test_critical_unsuitable_net_raises(net, words):
         CriticalSampler(4, net)(torch.rand(1, 9, 3))
 
 
-def test_critical_by_features_equals_those_of_a_net(rng):
+def test_critical_by_features_equals_those_of_a_net(randn):
     net = PointNetVanilla(3).eval()
-    points = torch.randn(3, 60, 3, generator=rng)
+    points = randn(3, 60, 3)
     expected = CriticalSampler(20, net)(points)
     found = CriticalSampler(20).by_features(points, net.point_features(points), 20)
     assert torch.equal(found.points, expected.points)
@@ -101,18 +102,18 @@ def test_critical_fills_up_by_farthest_points(line, chosen):
     assert rows == (chosen or plain_farthest(points[0], rows[:1], 3))
 
 
-def test_critical_ties_keep_seeded_order(rng):
+def test_critical_ties_keep_seeded_order(randn):
     class OwnChannels(torch.nn.Module):
         def point_features(self, points):
             return torch.eye(points.shape[1]).expand(len(points), -1, -1)
 
-    points = torch.randn(2, 60, 3, generator=rng)
+    points = randn(2, 60, 3)
     for seed in (0, 1):
         rows = CriticalSampler(20, OwnChannels(), seed)(points).indices
         assert torch.equal(rows, seeded_order(points, seed)[:, :20])
 
 
-def test_critical_leaves_modes_of_a_failing_net_as_they_are(rng):
+def test_critical_leaves_modes_of_a_failing_net_as_they_are(randn):
     net: Any = PointNetVanilla(3)
     net.pool.eval()
     modes = modes_of(net)
@@ -120,6 +121,6 @@ def test_critical_leaves_modes_of_a_failing_net_as_they_are(rng):
     net.point_features = None
 
     with pytest.raises(TypeError):
-        sampler(torch.randn(2, 40, 3, generator=rng))
+        sampler(randn(2, 40, 3))
 
     assert modes_of(net) == modes

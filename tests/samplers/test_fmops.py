@@ -3,6 +3,7 @@ import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from mops_lightning import FMOPSNet, MOPSNet
 from tests.support.losses import subset_loss
@@ -13,18 +14,18 @@ def small(m_max=16, **settings):
     return FMOPSNet(m_max, feature_channels=(8, 6), rho_channels=(12, 10), **settings)
 
 
-def test_fmops_equals_mops_with_sliced_weights(rng):
-    points = torch.randn(3, 40, 3, generator=rng)
+def test_fmops_equals_mops_with_sliced_weights(randn):
+    points = randn(3, 40, 3)
     flexible = small()
     fixed = MOPSNet(5, feature_channels=(8, 6), rho_channels=(12, 10))
     state = flexible.state_dict()
     state["queries.weight"] = state["queries.weight"][:5]
     fixed.load_state_dict(state, strict=True)
-    torch.testing.assert_close(fixed.eval()(points).points, flexible.eval()(points, 5).points)
+    assert_close(fixed.eval()(points).points, flexible.eval()(points, 5).points)
 
 
-def test_fmops_sizes_share_one_forward_pass(rng):
-    points = torch.randn(3, 40, 3, generator=rng)
+def test_fmops_sizes_share_one_forward_pass(randn):
+    points = randn(3, 40, 3)
     net = small(alpha=2.0).train()
     calls = []
     net.features.register_forward_hook(lambda *_: calls.append(1))
@@ -34,7 +35,7 @@ def test_fmops_sizes_share_one_forward_pass(rng):
     for m, output in outputs.items():
         assert output.points.shape[1] == len(output.matrix.queries) == m
         expected = 2 * subset_loss(points, output.points)
-        torch.testing.assert_close(output.losses["subset"], expected)
+        assert_close(output.losses["subset"], expected)
 
 
 def drawn(number, m_max=512, **settings):

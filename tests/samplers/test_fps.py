@@ -8,25 +8,25 @@ from mops_lightning.samplers.ordering import seeded_order
 from tests.support.plain import plain_farthest
 
 
-def test_fps_sampler_equals_double_loop(rng):
-    points = torch.randn(3, 50, 3, generator=rng)
+def test_fps_sampler_equals_double_loop(randn):
+    points = randn(3, 50, 3)
     chosen = FPSSampler(12, seed=5)(points).indices
     first = seeded_order(points, 5)[:, 0]
     for b in range(3):
         assert chosen[b].tolist() == plain_farthest(points[b], [int(first[b])], 12)
 
 
-def test_fps_sampler_uses_start(rng):
-    points = torch.randn(3, 50, 3, generator=rng)
+def test_fps_sampler_uses_start(randn):
+    points = randn(3, 50, 3)
     chosen = FPSSampler(12, start=49)(points).indices
     assert torch.equal(chosen, farthest_point_sample(points, 12, start=49))
     with pytest.raises(UserError, match=r"^start must be less than .* N=9, got 9"):
         FPSSampler(4, start=9)(torch.zeros(1, 9, 3))
 
 
-def test_fps_sampler_with_weights_starts_at_the_heaviest_point(rng):
-    points = torch.randn(20, 50, 3, generator=rng)
-    weight = torch.rand(20, 50, generator=rng)
+def test_fps_sampler_with_weights_starts_at_the_heaviest_point(randn, rand):
+    points = randn(20, 50, 3)
+    weight = rand(20, 50)
     sampler = FPSSampler(3)
     from_row_7 = FPSSampler(3, start=7)
 
@@ -37,8 +37,8 @@ def test_fps_sampler_with_weights_starts_at_the_heaviest_point(rng):
     assert rows_from_7[:, 0].tolist() == [7] * 20
 
 
-def test_fps_sampler_farthest_start_equals_plain_form(rng):
-    points = torch.randn(3, 50, 3, generator=rng)
+def test_fps_sampler_farthest_start_equals_plain_form(randn):
+    points = randn(3, 50, 3)
 
     indices = FPSSampler(12, start="farthest")(points).indices
 
@@ -48,9 +48,9 @@ def test_fps_sampler_farthest_start_equals_plain_form(rng):
         assert rows.tolist() == plain_farthest(cloud, [farthest], 12)
 
 
-def test_fps_sampler_farthest_start_moves_with_the_cloud(rng):
-    points = torch.randn(3, 50, 3, generator=rng)
-    rotation, _ = torch.linalg.qr(torch.randn(3, 3, generator=rng))
+def test_fps_sampler_farthest_start_moves_with_the_cloud(rng, randn):
+    points = randn(3, 50, 3)
+    rotation, _ = torch.linalg.qr(randn(3, 3))
     order = torch.randperm(50, generator=rng)
     moved = points[:, order] @ rotation + 1
     sampler = FPSSampler(12, start="farthest")

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from mops_lightning import FMOPSNet, MOPSNet
 from mops_lightning.errors import UserError
@@ -150,13 +151,13 @@ def test_local_columns_equal_a_dense_softmax_with_infinite_logits_outside(
 
     dense = plain_dense(net, points, 6)
     expected = dense.mT @ points
-    torch.testing.assert_close(output.matrix.dense(), dense)
-    torch.testing.assert_close(output.points, expected)
+    assert_close(output.matrix.dense(), dense)
+    assert_close(output.points, expected)
     inputs = [points, *net.parameters()]
     along = (output.points * direction).sum()
     gradients = torch.autograd.grad(along, inputs, retain_graph=True)
     expected_gradients = torch.autograd.grad((expected * direction).sum(), inputs)
-    torch.testing.assert_close(gradients, expected_gradients)
+    assert_close(gradients, expected_gradients)
     if neighbours != 1:
         for gradient in expected_gradients:
             assert gradient.abs().max() > 0
@@ -174,12 +175,12 @@ def test_local_views_of_s_equal_those_of_the_dense_matrix(rng):
     kept = dense.where(is_large, 0.0)
     renormalised = kept / kept.sum(1, keepdim=True)
     assert dense.shape == (2, 70, 10)
-    torch.testing.assert_close(dense.sum(1), torch.ones(2, 10, dtype=DOUBLE))
-    torch.testing.assert_close(matrix.gram(), dense.mT @ dense)
+    assert_close(dense.sum(1), torch.ones(2, 10, dtype=DOUBLE))
+    assert_close(matrix.gram(), dense.mT @ dense)
     assert torch.equal(matrix.nonzero_counts(), is_large.sum(1).double())
-    torch.testing.assert_close(matrix.sparse().to_dense(), renormalised)
+    assert_close(matrix.sparse().to_dense(), renormalised)
     assert torch.equal(matrix.first_cloud().dense(), dense[:1])
-    torch.testing.assert_close(matrix.sample(values), dense.mT @ values)
+    assert_close(matrix.sample(values), dense.mT @ values)
 
 
 def test_local_sparse_keeps_the_largest_entry_of_a_column_without_large_ones(rng):
@@ -206,11 +207,11 @@ def test_local_overlap_equals_that_of_the_dense_matrix(rng):
     off_diagonal = gram - diagonal
     expected = 2.0 * off_diagonal.sum((1, 2)).mean() / 10
     overlap = output.losses["overlap"]
-    torch.testing.assert_close(overlap, expected)
+    assert_close(overlap, expected)
     slots = net.queries.slots
     gradient = torch.autograd.grad(overlap, slots, retain_graph=True)
     expected_gradient = torch.autograd.grad(expected, slots)
-    torch.testing.assert_close(gradient, expected_gradient)
+    assert_close(gradient, expected_gradient)
 
 
 def test_local_smaller_samples_are_prefixes_with_one_loss_for_each(rng):
@@ -224,21 +225,21 @@ def test_local_smaller_samples_are_prefixes_with_one_loss_for_each(rng):
     whole = net(points)
     few = net(points, 2)
 
-    torch.testing.assert_close(few.points, whole.points[:, :2])
-    torch.testing.assert_close(few.matrix.dense(), whole.matrix.dense()[..., :2])
+    assert_close(few.points, whole.points[:, :2])
+    assert_close(few.matrix.dense(), whole.matrix.dense()[..., :2])
     first_two = whole.first(2).matrix
-    torch.testing.assert_close(first_two.gram(), few.matrix.gram())
+    assert_close(first_two.gram(), few.matrix.gram())
     assert set(of_sizes[2].losses) == {"subset", "overlap"}
 
 
-def test_local_columns_do_not_depend_on_the_order_of_the_points(rng):
+def test_local_columns_do_not_depend_on_the_order_of_the_points(rng, randn):
     net = local(m=10, candidates=3, neighbours=8).eval()
-    points = torch.randn(1, 70, 3, dtype=DOUBLE, generator=rng)
+    points = randn(1, 70, 3, dtype=DOUBLE)
     order = torch.randperm(70, generator=rng)
 
     again = net(points[:, order]).points
 
-    torch.testing.assert_close(again, net(points).points)
+    assert_close(again, net(points).points)
 
 
 def test_local_neighbours_by_a_tree_equal_all_distances(rng, monkeypatch):
@@ -254,11 +255,11 @@ def test_local_neighbours_by_a_tree_equal_all_distances(rng, monkeypatch):
     assert nearest_by_tree.shape == (2, 40, 1)
 
 
-def test_column_weights_in_loops_equal_a_softmax_of_gathered_entries(rng, monkeypatch):
+def test_column_weights_in_loops_equal_a_softmax_of_gathered_entries(rng, rand, monkeypatch):
     queries = drawn_normal(rng, 2, 5, 37, requires_grad=True)
     keys = drawn_normal(rng, 2, 9, 37, requires_grad=True)
     points = drawn_normal(rng, 2, 9, 3, requires_grad=True)
-    sharpness = torch.rand(2, 5, dtype=torch.float64, generator=rng, requires_grad=True)
+    sharpness = rand(2, 5, dtype=torch.float64, requires_grad=True)
     anchors = torch.randint(9, (2, 5), generator=rng)  # some repeat
     places = torch.randint(9, (2, 5, 4), generator=rng)
     inputs = (queries, keys, points, sharpness)
@@ -271,11 +272,11 @@ def test_column_weights_in_loops_equal_a_softmax_of_gathered_entries(rng, monkey
 
     assert torch.autograd.gradcheck(columns, inputs)
     monkeypatch.setattr(local_attention, "_has_loops", lambda _: False)
-    torch.testing.assert_close(weights, columns(*inputs))
+    assert_close(weights, columns(*inputs))
 
 
-def test_weighted_sums_equal_those_of_gathered_rows_and_so_do_their_gradients(rng):
-    weights = torch.rand(2, 5, 4, dtype=DOUBLE, generator=rng, requires_grad=True)
+def test_weighted_sums_equal_those_of_gathered_rows_and_so_do_their_gradients(rng, rand):
+    weights = rand(2, 5, 4, dtype=DOUBLE, requires_grad=True)
     values = drawn_normal(rng, 2, 9, 3, requires_grad=True)
     rows = torch.randint(9, (2, 5, 4), generator=rng)  # some repeat
 
@@ -286,7 +287,7 @@ def test_weighted_sums_equal_those_of_gathered_rows_and_so_do_their_gradients(rn
 
     gathered = gather_points(values, rows)
     expected = (weights[..., None] * gathered).sum(2)
-    torch.testing.assert_close(sums, expected)
+    assert_close(sums, expected)
     assert torch.autograd.gradcheck(sums_of, (weights, values))
 
 
@@ -313,7 +314,7 @@ def test_local_columns_in_half_precision_are_near_those_in_single(dtype, rng):
     in_half = net.to(dtype)(points).points
 
     assert in_half.dtype == dtype
-    torch.testing.assert_close(in_half.float(), in_single, atol=0.05, rtol=0)
+    assert_close(in_half.float(), in_single, atol=0.05, rtol=0)
 
 
 @pytest.mark.parametrize(

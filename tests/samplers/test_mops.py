@@ -1,6 +1,7 @@
 import pytest
 import torch
 from torch import nn
+from torch.testing import assert_close
 
 from mops_lightning.losses.subset import overlap_losses
 from mops_lightning.nets.layers import linear_norm_relu
@@ -51,19 +52,19 @@ class PlainMOPS(nn.Module):
 
 
 @pytest.mark.parametrize("training", [True, False])
-def test_mops_equals_published_form(training, rng):
+def test_mops_equals_published_form(training, randn):
     fast = small(tau_min=0.3).double().train(training)
     plain = PlainMOPS(fast).double().train(training)
-    points = torch.randn(3, 20, 3, dtype=torch.float64, generator=rng, requires_grad=True)
-    direction = torch.randn(3, 5, 3, dtype=torch.float64, generator=rng)
+    points = randn(3, 20, 3, dtype=torch.float64, requires_grad=True)
+    direction = randn(3, 5, 3, dtype=torch.float64)
 
     output = fast(points)
 
     matrix, sampled = plain(points)
     # The plain twin has a bias in its last layer, which the softmax must cancel.
     assert plain.last.bias.abs().min() > 0
-    torch.testing.assert_close(output.points, sampled)
-    torch.testing.assert_close(output.matrix.dense(), matrix)
+    assert_close(output.points, sampled)
+    assert_close(output.matrix.dense(), matrix)
     shared = [points, *fast.features.parameters()]
     along = (output.points * direction).sum()
     gradients = torch.autograd.grad(along, [*shared, fast.queries.weight])
@@ -71,7 +72,7 @@ def test_mops_equals_published_form(training, rng):
     expected = torch.autograd.grad(plain_along, [*shared, plain.last.weight])
     assert expected[0].abs().max() > 0
     assert expected[1].abs().max() > 0
-    torch.testing.assert_close(gradients, expected)
+    assert_close(gradients, expected)
 
 
 def test_mops_has_published_layers():
@@ -104,16 +105,16 @@ def test_tau_decreases_exponentially_and_is_tau_min_in_evaluation():
     assert net.train().tau == 1.0
 
 
-def test_mops_loss_is_weighted_and_in_training_only(rng):
+def test_mops_loss_is_weighted_and_in_training_only(randn):
     net = small(alpha=7.0).train()
-    points = torch.randn(2, 20, 3, generator=rng)
+    points = randn(2, 20, 3)
     output = net(points)
-    torch.testing.assert_close(output.losses["subset"], 7.0 * subset_loss(points, output.points))
+    assert_close(output.losses["subset"], 7.0 * subset_loss(points, output.points))
     assert net.eval()(points).losses == {}
 
 
-def test_mops_overlap_adds_weighted_penalty(rng):
-    points = torch.randn(3, 40, 3, generator=rng)
+def test_mops_overlap_adds_weighted_penalty(randn):
+    points = randn(3, 40, 3)
     without = small().train()
     net = small(overlap=4.0).train()
 
@@ -123,21 +124,21 @@ def test_mops_overlap_adds_weighted_penalty(rng):
     assert set(losses_without) == {"subset"}
     assert output.losses["subset"] == losses_without["subset"]
     penalties = overlap_losses(output.matrix, (5,))
-    torch.testing.assert_close(output.losses["overlap"], 4 * penalties[5])
+    assert_close(output.losses["overlap"], 4 * penalties[5])
 
 
-def test_mops_threshold_drops_small_entries_in_evaluation_only(rng):
-    points = torch.randn(2, 20, 3, generator=rng)
+def test_mops_threshold_drops_small_entries_in_evaluation_only(randn):
+    points = randn(2, 20, 3)
     net = small(tau_min=0.02, threshold=0.05).train()
     without = small(tau_min=0.02).train()
 
     in_training = net(points)
     in_evaluation = net.eval()(points)
 
-    torch.testing.assert_close(in_training.points, without(points).points)
+    assert_close(in_training.points, without(points).points)
     matrix = in_evaluation.matrix.dense()
     kept = matrix.where(matrix >= 0.05, 0.0)
     assert (kept > 0).any(1).all()
     assert (kept == 0).any()
     renormalised = kept / kept.sum(1, keepdim=True)
-    torch.testing.assert_close(in_evaluation.points, renormalised.mT @ points)
+    assert_close(in_evaluation.points, renormalised.mT @ points)

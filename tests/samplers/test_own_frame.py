@@ -4,6 +4,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from mops_lightning import FMOPSNet
 from mops_lightning.channels import NO_CHANNELS, Channel, PointChannels
@@ -41,7 +42,7 @@ def test_sample_of_a_turned_cloud_is_the_turned_sample(columns, rng):
     sample = sampler(clouds).points
     sample_of_turned = sampler(turned).points
 
-    torch.testing.assert_close(sample_of_turned, sample @ rotations.mT + shift)
+    assert_close(sample_of_turned, sample @ rotations.mT + shift)
 
 
 def test_sample_of_plain_anchors_does_not_turn_with_its_cloud(rng):
@@ -62,16 +63,16 @@ def test_own_axes_of_known_farthest_points():
     first, second, third = axes.T
     assert first.tolist() == [1, 0, 0]
     assert second.abs().tolist() == [0, 0, 1]
-    torch.testing.assert_close(third, torch.linalg.cross(first, second))
+    assert_close(third, torch.linalg.cross(first, second))
 
 
-def test_own_axes_are_rotations(rng):
-    clouds = torch.randn(5, 40, 3, dtype=torch.float64, generator=rng)
+def test_own_axes_are_rotations(randn):
+    clouds = randn(5, 40, 3, dtype=torch.float64)
 
     axes = own_axes(clouds - clouds.mean(1, keepdim=True))
 
-    torch.testing.assert_close(axes.mT @ axes, torch.eye(3).double().expand(5, 3, 3))
-    torch.testing.assert_close(torch.linalg.det(axes), torch.ones(5).double())
+    assert_close(axes.mT @ axes, torch.eye(3).double().expand(5, 3, 3))
+    assert_close(torch.linalg.det(axes), torch.ones(5).double())
 
 
 @pytest.mark.parametrize("number", [1, 2, 3, 9])
@@ -82,18 +83,16 @@ def test_points_on_one_line_give_finite_coordinates(number, direction):
     described = in_own_frame(points[None], NO_CHANNELS)[0]
 
     distances = (points - points.mean(0)).norm(dim=1)
-    torch.testing.assert_close(described[:, 0].abs(), distances)
+    assert_close(described[:, 0].abs(), distances)
     assert described[:, 1:].abs().max() < 1e-5
 
 
-def test_normals_turn_with_the_cloud(rng):
+def test_normals_turn_with_the_cloud(rng, randn):
     clouds, turned, rotations, _ = turned_pair(rng)
-    normals = torch.nn.functional.normalize(
-        torch.randn(clouds.shape, generator=rng).double(), dim=2
-    )
+    normals = torch.nn.functional.normalize(randn(clouds.shape).double(), dim=2)
     channels = PointChannels(map(Channel, ("normal_x", "normal_y", "normal_z")))
 
     described = in_own_frame(torch.cat([clouds, normals], 2), channels)
     described_turned = in_own_frame(torch.cat([turned, normals @ rotations.mT], 2), channels)
 
-    torch.testing.assert_close(described, described_turned)
+    assert_close(described, described_turned)

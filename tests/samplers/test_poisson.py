@@ -70,8 +70,8 @@ def in_steps(points, m, weight=None):
 
 
 @pytest.mark.parametrize("m", [2, 9, 23, 24])  # the last two points are equally crowded
-def test_eliminate_equals_published_formula(m, rng):
-    points = torch.randn(3, 24, 3, generator=rng, dtype=torch.float64)
+def test_eliminate_equals_published_formula(m, randn):
+    points = randn(3, 24, 3, dtype=torch.float64)
     reach = spacing_bound(points, m)
 
     kept = eliminate(points, m)
@@ -81,8 +81,8 @@ def test_eliminate_equals_published_formula(m, rng):
         assert kept[row].tolist() == expected
 
 
-def test_eliminate_to_one_point_has_reach_of_bounding_box(rng):
-    cloud = torch.randn(24, 3, generator=rng, dtype=torch.float64)
+def test_eliminate_to_one_point_has_reach_of_bounding_box(randn):
+    cloud = randn(24, 3, dtype=torch.float64)
     diagonal = cloud.amax(0) - cloud.amin(0)
 
     kept = eliminate(cloud[None], 1)
@@ -103,17 +103,17 @@ def test_eliminate_equals_plain_form(n, m, kind, rng):
 
 @pytest.mark.parametrize("channels", [1, 2, 5])
 @pytest.mark.parametrize("m", [1, 20, 150])
-def test_eliminate_of_other_dimensions_equals_plain_form(m, channels, rng):
-    points = torch.randn(2, 300, channels, generator=rng, dtype=torch.float64)
+def test_eliminate_of_other_dimensions_equals_plain_form(m, channels, randn):
+    points = randn(2, 300, channels, dtype=torch.float64)
 
     assert torch.equal(eliminate(points, m), in_steps(points, m))
 
 
 @pytest.mark.parametrize("kind", ["sphere", "copies", "outlier"])
 @pytest.mark.parametrize(("n", "m"), [(40, 39), (300, 1), (300, 20), (300, 150)])
-def test_eliminate_divides_crowding_by_weight(n, m, kind, rng):
+def test_eliminate_divides_crowding_by_weight(n, m, kind, rng, rand):
     points = cloud_of(kind, (1, n), torch.float32, rng)
-    weight = torch.rand(1, n, generator=rng).double() + 0.01
+    weight = rand(1, n).double() + 0.01
 
     kept = eliminate(points, m, weight)
 
@@ -133,8 +133,8 @@ def test_eliminate_of_many_copies_removes_the_lowest_row_of_them():
     assert kept[0].tolist() == [0, *range(2, 8200)]
 
 
-def test_eliminate_of_points_not_contiguous_equals_plain_form(rng):
-    points = torch.rand(3, 400, 2, generator=rng, dtype=torch.float64)
+def test_eliminate_of_points_not_contiguous_equals_plain_form(rand):
+    points = rand(3, 400, 2, dtype=torch.float64)
     not_contiguous = points.transpose(0, 2)[:, ::2]
 
     kept = eliminate(not_contiguous, 30)
@@ -142,8 +142,8 @@ def test_eliminate_of_points_not_contiguous_equals_plain_form(rng):
     assert torch.equal(kept, in_steps(not_contiguous, 30))
 
 
-def test_poisson_of_points_with_gradients_keeps_the_same_points(rng):
-    points = torch.rand(2, 200, 3, generator=rng, dtype=torch.float64)
+def test_poisson_of_points_with_gradients_keeps_the_same_points(rand):
+    points = rand(2, 200, 3, dtype=torch.float64)
     with_gradients = points.clone().requires_grad_()
     sampler = PoissonSampler(30)
 
@@ -153,8 +153,8 @@ def test_poisson_of_points_with_gradients_keeps_the_same_points(rng):
 
 
 @pytest.mark.parametrize("m", [2, 5, 12])
-def test_spacing_bound_is_upper_bound(m, rng):
-    points = torch.randn(20, 30, 3, generator=rng, dtype=torch.float64)
+def test_spacing_bound_is_upper_bound(m, rng, randn):
+    points = randn(20, 30, 3, dtype=torch.float64)
 
     bound = spacing_bound(points, m)
 
@@ -171,8 +171,8 @@ def spacing(points):
     return distances.amin((1, 2))
 
 
-def test_poisson_is_more_even_than_random(rng):
-    flat = torch.rand(8, 600, 3, generator=rng) * torch.tensor([1.0, 1.0, 0.0])
+def test_poisson_is_more_even_than_random(rand):
+    flat = rand(8, 600, 3) * torch.tensor([1.0, 1.0, 0.0])
 
     poisson = PoissonSampler(60)(flat)
     random = RandomSampler(60)(flat)

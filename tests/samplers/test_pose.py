@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
 from mops_lightning import PoseSampler
 from mops_lightning.errors import UserError
@@ -37,7 +38,7 @@ def test_log_residuals_are_in_the_order_of_the_points(sampler, cloud):
 
     expected = sampler(cloud).log_residuals[:, shuffled]
 
-    torch.testing.assert_close(sampler(cloud[:, shuffled]).log_residuals, expected)
+    assert_close(sampler(cloud[:, shuffled]).log_residuals, expected)
 
 
 def test_log_residuals_have_gradients_for_all_weights(sampler, cloud):

@@ -174,11 +174,11 @@ TRAINED = "net"
 
 
 @pytest.mark.parametrize("sampler", [FPSSampler(8), PoissonSampler(8), RandomSampler(8), TRAINED])
-def test_weights_of_single_batched_and_ragged_clouds_agree(sampler, net, rng):
+def test_weights_of_single_batched_and_ragged_clouds_agree(sampler, net, rand):
     if sampler == TRAINED:
         sampler = net
-    points = 9 * torch.rand(3, 40, 3, generator=rng)
-    weight = torch.rand(3, 40, generator=rng)
+    points = 9 * rand(3, 40, 3)
+    weight = rand(3, 40)
     weight[1, ::2] = 0  # left out
     batch = torch.arange(3).repeat_interleave(40)
     joined = points.flatten(0, 1).numpy()
@@ -199,8 +199,8 @@ def test_weights_of_single_batched_and_ragged_clouds_agree(sampler, net, rng):
         assert len(rows_alone.unique()) == 8
 
 
-def test_weights_by_curvature_are_those_of_each_cloud(rng):
-    points = torch.rand(90, 3, generator=rng)
+def test_weights_by_curvature_are_those_of_each_cloud(rand):
+    points = rand(90, 3)
     weight = curvature(points.numpy())
     twice = torch.cat([points, points])
     batch = torch.arange(180) // 90

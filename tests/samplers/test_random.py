@@ -17,9 +17,9 @@ def chi_square_p(counts, expected, share):
     return chdtrc(freedom, statistic * freedom / number)
 
 
-def test_random_places_are_uniform(rng):
+def test_random_places_are_uniform(randn):
     """Neither points on one side of a cloud nor points near its centre are preferred."""
-    points = torch.randn(4000, 50, 3, generator=rng)
+    points = randn(4000, 50, 3)
     sides = points[..., 0]
     radii = points.norm(dim=2)
 
@@ -45,16 +45,16 @@ def test_random_pairs_are_uniform(rng):
     assert chi_square_p(counts, 1500 / 20, 1 / 20) > 1e-3
 
 
-def test_random_shared_point_is_chosen_independently(rng):
-    points = torch.randn(4000, 20, 3, generator=rng)
+def test_random_shared_point_is_chosen_independently(randn):
+    points = randn(4000, 20, 3)
     points[:, 0] = 0.0
     share = (RandomSampler(5)(points).indices == 0).any(1).float().mean()
     assert abs(share - 5 / 20) < 0.03
 
 
-def test_random_copies_are_chosen_independently(rng):
+def test_random_copies_are_chosen_independently(randn):
     """100 draws from 200 points with two copies each give about 88 distinct points."""
-    points = torch.randn(20, 200, 3, generator=rng)
+    points = randn(20, 200, 3)
     twice = torch.cat([points, points], 1)
 
     rows = RandomSampler(100)(twice).indices % 200

@@ -4,6 +4,7 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from torch.testing import assert_close
 
 import mops_lightning.config.compose  # noqa: F401  registers the resolvers
 from mops_lightning.config.build import build
@@ -37,9 +38,9 @@ CHOICES = {
 
 
 @pytest.mark.parametrize("choice", CHOICES.values(), ids=CHOICES)
-def test_rival_trains_every_weight(choice, rng):
+def test_rival_trains_every_weight(choice, randn):
     sampler = composed(choice)
-    points = torch.randn(3, 50, 3, generator=rng)
+    points = randn(3, 50, 3)
 
     output = sampler(points)
     seen = output.points
@@ -54,9 +55,9 @@ def test_rival_trains_every_weight(choice, rng):
 
 
 @pytest.mark.parametrize("choice", CHOICES.values(), ids=CHOICES)
-def test_rival_ignores_order_of_points(choice, rng):
+def test_rival_ignores_order_of_points(choice, rng, randn):
     sampler = composed(choice)
-    points = torch.randn(3, 50, 3, generator=rng)
+    points = randn(3, 50, 3)
     order = torch.randperm(50, generator=rng)
     sampler(points)  # running statistics
     sampler.eval()
@@ -65,13 +66,13 @@ def test_rival_ignores_order_of_points(choice, rng):
     sampled_in_order = sampler(points[:, order])
 
     assert sampled.points.shape == (3, 6, 3)
-    torch.testing.assert_close(sampled_in_order.points, sampled.points, atol=1e-4, rtol=1e-4)
+    assert_close(sampled_in_order.points, sampled.points, atol=1e-4, rtol=1e-4)
     if not sampler.generates:
         assert torch.equal(order[sampled_in_order.indices], sampled.indices)
 
 
-def test_self_correlation_equals_plain_sums(rng):
-    cloud = torch.randn(7, 4, generator=rng)
+def test_self_correlation_equals_plain_sums(randn):
+    cloud = randn(7, 4)
 
     (correlation,) = lightn.self_correlation(cloud[None])
 
@@ -79,11 +80,11 @@ def test_self_correlation_equals_plain_sums(rng):
         products = (cloud * row).sum(1)
         shares = (products / 2).exp()
         weighted = shares[:, None] * cloud
-        torch.testing.assert_close(found, weighted.sum(0) / shares.sum())
+        assert_close(found, weighted.sum(0) / shares.sum())
 
 
-def test_soft_top_k_is_sigmoid_above_threshold_that_gives_k(rng):
-    scores = torch.randn(40, generator=rng)
+def test_soft_top_k_is_sigmoid_above_threshold_that_gives_k(randn):
+    scores = randn(40)
     low = -50.0
     high = 50.0
     for _ in range(60):
@@ -96,12 +97,12 @@ def test_soft_top_k_is_sigmoid_above_threshold_that_gives_k(rng):
 
     (found,) = selector.soft_top_k(scores[None], 9, 0.5, iterations=200)
 
-    torch.testing.assert_close(found, degrees, atol=1e-4, rtol=0)
+    assert_close(found, degrees, atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize(("variant", "neighbours"), [("local", 4), ("global", 20)])
-def test_apes_scores_equal_plain_attention_in_feature_space(variant, neighbours, rng):
-    features = torch.randn(20, 6, generator=rng)
+def test_apes_scores_equal_plain_attention_in_feature_space(variant, neighbours, randn):
+    features = randn(20, 6)
     sampling = apes.EdgeSampling(6, variant, k=4)
 
     scores, _, _ = sampling(features[None])
@@ -116,11 +117,11 @@ def test_apes_scores_equal_plain_attention_in_feature_space(variant, neighbours,
             expected[i] = weights.std(unbiased=False)
         else:
             expected[near] += weights
-    torch.testing.assert_close(scores[0], expected)
+    assert_close(scores[0], expected)
 
 
-def test_edge_convolution_equals_plain_maximum_over_neighbours(rng):
-    features = torch.randn(10, 4, generator=rng)
+def test_edge_convolution_equals_plain_maximum_over_neighbours(randn):
+    features = randn(10, 4)
     features[7] = features[2]  # a copy
     layer = edge_net.EdgeConvolution(4, 5, 6, k=3).eval()
 
@@ -133,11 +134,11 @@ def test_edge_convolution_equals_plain_maximum_over_neighbours(rng):
             difference = features[j] - centre
             edges.append(torch.cat([centre, difference]))
         values = layer.layers(torch.stack(edges))
-        torch.testing.assert_close(convolved[i], values.max(0).values)
+        assert_close(convolved[i], values.max(0).values)
 
 
-def test_neighbour_attention_equals_plain_heads_over_differences(rng):
-    features = torch.randn(9, 8, generator=rng)
+def test_neighbour_attention_equals_plain_heads_over_differences(randn):
+    features = randn(9, 8)
     block = edge_net.NeighbourAttention(8, heads=2, expansion=4, k=3)
 
     (attended,) = block.attend(features[None])
@@ -153,11 +154,11 @@ def test_neighbour_attention_equals_plain_heads_over_differences(rng):
             logits = keys[:, channels] @ query[channels] / 2
             heads.append(logits.softmax(0) @ values[:, channels])
         expected = torch.cat(heads)
-        torch.testing.assert_close(attended[i], expected, atol=1e-5, rtol=1e-5)
+        assert_close(attended[i], expected, atol=1e-5, rtol=1e-5)
 
 
-def test_apes_selects_from_all_points_in_two_stages(rng):
-    points = torch.randn(2, 200, 3, generator=rng)
+def test_apes_selects_from_all_points_in_two_stages(randn):
+    points = randn(2, 200, 3)
     sampler = apes.APES(5, k=4, channels=16).eval()
 
     output = sampler(points)
@@ -166,12 +167,12 @@ def test_apes_selects_from_all_points_in_two_stages(rng):
     assert output.indices.max() > 100
     assert len(first_rows.unique()) == 5
     assert len(second_rows.unique()) == 5
-    torch.testing.assert_close(output.points[1], points[1][second_rows])
+    assert_close(output.points[1], points[1][second_rows])
 
 
-def test_samble_scores_equal_plain_columns_over_neighbours(rng):
-    attention = torch.rand(1, 8, 8, generator=rng)
-    rows = torch.rand(1, 8, 8, generator=rng).argsort(2)[..., :3]
+def test_samble_scores_equal_plain_columns_over_neighbours(rand):
+    attention = rand(1, 8, 8)
+    rows = rand(1, 8, 8).argsort(2)[..., :3]
 
     (scores,) = samble.sparse_scores(attention, rows)
 
@@ -204,8 +205,8 @@ def test_samble_allots_points_by_weight_and_room(weights, available, m, want):
     assert got.tolist() == [want]
 
 
-def test_samble_takes_highest_priorities_of_every_bin(rng):
-    priorities = torch.randn(2, 12, generator=rng)
+def test_samble_takes_highest_priorities_of_every_bin(rng, randn):
+    priorities = randn(2, 12)
     bins = torch.randint(0, 3, (2, 12), generator=rng)
     bins[:, :6] = torch.tensor([0, 0, 1, 1, 2, 2])
     counts = torch.tensor([[2, 1, 2], [1, 2, 2]])
@@ -231,4 +232,4 @@ def test_samble_boundaries_divide_first_batch_equally_then_move_slowly(rng):
     layer._move_boundaries(scores + 10)
 
     assert first.tolist() == [29.0, 19.0, 9.0]
-    torch.testing.assert_close(layer.boundaries, first + 1)
+    assert_close(layer.boundaries, first + 1)

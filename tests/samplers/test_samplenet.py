@@ -2,6 +2,7 @@ import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from mops_lightning.ops.nearest import k_nearest, nearest
 from mops_lightning.ops.points import gather_points
@@ -28,27 +29,27 @@ def plain_projection(queries, points, k, sigma):
 
 
 @pytest.mark.parametrize("k", [1, 4, 11])
-def test_soft_projection_equals_double_loop(k, rng):
-    points = torch.randn(2, 11, 3, generator=rng, dtype=torch.float64).requires_grad_()
-    queries = torch.randn(2, 5, 3, generator=rng, dtype=torch.float64).requires_grad_()
+def test_soft_projection_equals_double_loop(k, randn):
+    points = randn(2, 11, 3, dtype=torch.float64).requires_grad_()
+    queries = randn(2, 5, 3, dtype=torch.float64).requires_grad_()
     sigma = torch.tensor(0.7, dtype=torch.float64, requires_grad=True)
-    direction = torch.randn(2, 5, 3, generator=rng, dtype=torch.float64)
+    direction = randn(2, 5, 3, dtype=torch.float64)
 
     fast = soft_projection(queries, points, k, sigma)
 
     plain = plain_projection(queries, points, k, sigma)
-    torch.testing.assert_close(fast, plain)
+    assert_close(fast, plain)
     if k == 1:
         return  # the weight is 1 for any query and sigma
     inputs = [queries, points, sigma]
     gradients = torch.autograd.grad((fast * direction).sum(), inputs)
     expected = torch.autograd.grad((plain * direction).sum(), inputs)
-    torch.testing.assert_close(gradients, expected)
+    assert_close(gradients, expected)
 
 
-def test_soft_projection_limits_are_nearest_point_and_mean(rng):
-    points = torch.randn(3, 50, 3, generator=rng)
-    queries = torch.randn(3, 9, 3, generator=rng)
+def test_soft_projection_limits_are_nearest_point_and_mean(randn):
+    points = randn(3, 50, 3)
+    queries = randn(3, 9, 3)
     _, nearest_rows = nearest(queries, points)
     _, near_rows = k_nearest(queries, points, 7)
 
@@ -56,15 +57,15 @@ def test_soft_projection_limits_are_nearest_point_and_mean(rng):
     sharpest = soft_projection(queries, points, 7, torch.tensor(1e-38))
     wide = soft_projection(queries, points, 7, 1e9)
 
-    torch.testing.assert_close(sharp, gather_points(points, nearest_rows))
+    assert_close(sharp, gather_points(points, nearest_rows))
     assert torch.isfinite(sharpest).all()
     neighbours = gather_points(points, near_rows)
-    torch.testing.assert_close(wide, neighbours.mean(2))
+    assert_close(wide, neighbours.mean(2))
 
 
-def test_samplenet_projects_in_training_only(rng):
+def test_samplenet_projects_in_training_only(randn):
     net = SampleNet(6, k=4, beta=0.5, alpha=3.0).train()
-    points = torch.randn(4, 20, 3, generator=rng)
+    points = randn(4, 20, 3)
     at_start = net(points)
     torch.nn.init.constant_(net.temperature, 0.6)
 
@@ -74,24 +75,24 @@ def test_samplenet_projects_in_training_only(rng):
     assert at_start.losses["projection"] == 0.5  # sigma starts at 1²
     generated = in_training.points
     projected = soft_projection(generated, points, 4, 0.6**2)
-    torch.testing.assert_close(in_training.soft_projected, projected)
+    assert_close(in_training.soft_projected, projected)
     projection_loss = torch.tensor(0.5 * 0.6**2)
-    torch.testing.assert_close(in_training.losses["projection"], projection_loss)
+    assert_close(in_training.losses["projection"], projection_loss)
     expected = 3 * simplification_loss(points, generated)
-    torch.testing.assert_close(in_training.losses["simplification"], expected)
+    assert_close(in_training.losses["simplification"], expected)
     assert in_test.soft_projected is None
 
 
-def test_samplenet_projection_in_evaluation_equals_double_loop_with_learned_temperature(rng):
+def test_samplenet_projection_in_evaluation_equals_double_loop_with_learned_temperature(randn):
     net = SampleNet(6, k=4)
     torch.nn.init.constant_(net.temperature, 0.3)
-    points = torch.randn(2, 20, 3, generator=rng)
+    points = randn(2, 20, 3)
     points[:, 10:] = points[:, :10]  # duplicates tie
     generated = net.eval()(points).points
 
     projected = net.project(generated, points)
 
-    torch.testing.assert_close(projected, plain_projection(generated, points, 4, 0.3**2))
+    assert_close(projected, plain_projection(generated, points, 4, 0.3**2))
 
 
 def test_samplenet_gamma_replaces_alpha():
@@ -118,9 +119,9 @@ def test_progressive_training_sizes_are_powers_of_two():
     assert ProgressiveSampleNet(1).training_sizes() == (1,)
 
 
-def test_progressive_samples_are_nested(rng):
+def test_progressive_samples_are_nested(randn):
     net = ProgressiveSampleNet(16, coverage=0.5, coverage_per_point=1 / 30).train()
-    points = torch.randn(4, 40, 3, generator=rng)
+    points = randn(4, 40, 3)
     net(points)  # running statistics change with every call, the result does not
     whole = net(points).points
 
@@ -131,13 +132,13 @@ def test_progressive_samples_are_nested(rng):
         first = whole[:, :m]
         assert torch.equal(output.points, first)
         expected = 30 * simplification_loss(points, first, 0.5, 1 / 30)
-        torch.testing.assert_close(output.losses["simplification"], expected)
+        assert_close(output.losses["simplification"], expected)
 
 
 @pytest.mark.parametrize("reduction", ["sum", "mean"])
-def test_progressive_samplenet_adds_projection_once(reduction, rng):
+def test_progressive_samplenet_adds_projection_once(reduction, randn):
     net = ProgressiveSampleNet(16, k=3, beta=0.5, size_reduction=reduction).train()
-    points = torch.randn(4, 30, 3, generator=rng)
+    points = randn(4, 30, 3)
     sizes = net.training_sizes()
 
     outputs = net.sample_sizes(points, sizes)
@@ -145,4 +146,4 @@ def test_progressive_samplenet_adds_projection_once(reduction, rng):
     assert len(sizes) == 4
     losses = torch.stack([outputs[m].losses["projection"] for m in sizes])
     total = losses.sum() if reduction == "sum" else losses.mean()
-    torch.testing.assert_close(total, torch.tensor(0.5))  # sigma starts at 1
+    assert_close(total, torch.tensor(0.5))  # sigma starts at 1

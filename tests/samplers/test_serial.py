@@ -23,8 +23,8 @@ def test_codes_interleave_the_bits_of_the_cells(rng):
     assert codes.tolist() == expected
 
 
-def test_serial_takes_every_kth_point_along_the_curve(rng):
-    points = torch.rand(2, 90, 3, generator=rng)
+def test_serial_takes_every_kth_point_along_the_curve(rand):
+    points = rand(2, 90, 3)
     indices = SerialSampler(9)(points).indices
     for codes, chosen in zip(morton_codes(points), indices, strict=True):
         assert codes[chosen].tolist() == codes.sort().values[5::10].tolist()

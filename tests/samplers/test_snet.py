@@ -4,6 +4,7 @@ from typing import Any
 import pytest
 import torch
 from torch import nn
+from torch.testing import assert_close
 
 from mops_lightning.samplers.snet import SNet
 from tests.support.losses import simplification_loss
@@ -47,19 +48,19 @@ def plain_snet(net, points):
     return hidden.reshape(len(points), -1, 3)
 
 
-def test_snet_equals_written_out_formulas(rng):
+def test_snet_equals_written_out_formulas(randn):
     net = SNet(6, feature_channels=(8, 11, 10), head_channels=(12, 9, 7)).double().train()
-    points = torch.randn(4, 20, 3, generator=rng, dtype=torch.float64)
+    points = randn(4, 20, 3, dtype=torch.float64)
     for _ in range(3):  # so that the running statistics differ from their initial values
         net(points)
     net.eval()
-    torch.testing.assert_close(net(points).points, plain_snet(net, points))
+    assert_close(net(points).points, plain_snet(net, points))
 
 
-def test_snet_loss_is_weighted_and_in_training_only(rng):
+def test_snet_loss_is_weighted_and_in_training_only(randn):
     net = SNet(6, alpha=3.0, coverage=0.5, coverage_per_point=0.25).train()
-    points = torch.randn(4, 20, 3, generator=rng)
+    points = randn(4, 20, 3)
     output = net(points)
     expected = 3 * simplification_loss(points, output.points, 0.5, 0.25)
-    torch.testing.assert_close(output.losses["simplification"], expected)
+    assert_close(output.losses["simplification"], expected)
     assert net.eval()(points).losses == {}

@@ -1,5 +1,6 @@
 import pytest
 import torch
+from torch.testing import assert_close
 
 from mops_lightning import FMOPSNet, MOPSNet, SNet
 from mops_lightning.errors import UserError
@@ -7,20 +8,20 @@ from mops_lightning.samplers.base import stream_sample
 
 
 @pytest.mark.parametrize("size", [1, 7, 1000, 5000])
-def test_stream_sample_equals_whole_cloud(trained, size, rng):
-    points = torch.randn(1, 30 if size == 1 else 3000, 3, generator=rng)
+def test_stream_sample_equals_whole_cloud(trained, size, randn):
+    points = randn(1, 30 if size == 1 else 3000, 3)
     with torch.no_grad():
         whole = trained(points).points
     streamed = stream_sample(trained, lambda: points[0].split(size))
-    torch.testing.assert_close(streamed, whole[0], rtol=0, atol=1e-5)
+    assert_close(streamed, whole[0], rtol=0, atol=1e-5)
 
 
-def test_stream_sample_is_nested(rng):
+def test_stream_sample_is_nested(randn):
     torch.manual_seed(1)
     sampler = FMOPSNet(24).eval()
-    points = torch.randn(200, 3, generator=rng)
+    points = randn(200, 3)
     few = stream_sample(sampler, lambda: points.split(64), 5)
-    torch.testing.assert_close(few, stream_sample(sampler, lambda: points.split(64))[:5])
+    assert_close(few, stream_sample(sampler, lambda: points.split(64))[:5])
 
 
 @pytest.mark.parametrize(
@@ -41,20 +42,20 @@ def test_stream_sample_invalid_input_raises(make, chunks, message):
 
 
 @pytest.mark.parametrize(("clouds", "points"), [(3, 40), (2, 2500), (1, 24)])
-def test_fused_evaluation_equals_layers(trained, clouds, points, rng):
-    batch = torch.randn(clouds, points, 3, generator=rng)
+def test_fused_evaluation_equals_layers(trained, clouds, points, randn):
+    batch = randn(clouds, points, 3)
     plain = trained(batch)
     with torch.no_grad():
         fast = trained(batch)
     assert plain.points.requires_grad
     assert not fast.points.requires_grad
-    torch.testing.assert_close(fast.points, plain.points.detach(), rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(fast.matrix.dense(), plain.matrix.dense(), rtol=1e-3, atol=1e-6)
+    assert_close(fast.points, plain.points.detach(), rtol=1e-4, atol=1e-5)
+    assert_close(fast.matrix.dense(), plain.matrix.dense(), rtol=1e-3, atol=1e-6)
 
 
-def test_training_without_gradients_uses_batch_statistics(trained, rng):
-    batch = torch.randn(3, 40, 3, generator=rng)
+def test_training_without_gradients_uses_batch_statistics(trained, randn):
+    batch = randn(3, 40, 3)
     trained.train()
     with torch.no_grad():
         fast = trained(batch).points
-    torch.testing.assert_close(fast, trained(batch).points.detach())
+    assert_close(fast, trained(batch).points.detach())

@@ -44,8 +44,8 @@ def assert_nearest_to_mean(row, cloud, voxel, tolerance=0.0):
 
 
 @pytest.mark.parametrize("m", [2, 13, 60])
-def test_voxel_equals_plain_search(m, rng):
-    points = torch.randn(3, 100, 3, dtype=torch.float64, generator=rng)
+def test_voxel_equals_plain_search(m, randn):
+    points = randn(3, 100, 3, dtype=torch.float64)
 
     picked = VoxelSampler(m)(points)
 
@@ -56,10 +56,10 @@ def test_voxel_equals_plain_search(m, rng):
 
 
 @pytest.mark.parametrize("name", ["clusters", "grid", "map"])
-def test_fullest_voxels_equal_plain_search(name, rng):
+def test_fullest_voxels_equal_plain_search(name, randn, rand):
     """Most positions settle in their voxels long before the last step."""
-    points = torch.randn(1, 900, 3, dtype=torch.float64, generator=rng)
-    spread = torch.rand(1, 900, 1, dtype=torch.float64, generator=rng) ** 4
+    points = randn(1, 900, 3, dtype=torch.float64)
+    spread = rand(1, 900, 1, dtype=torch.float64) ** 4
     size = torch.tensor([90.0, 40.0, 3.0])
     origin = torch.tensor([637e3, 851e3, 412.0])
     clouds = {
@@ -77,15 +77,15 @@ def test_fullest_voxels_equal_plain_search(name, rng):
         assert_nearest_to_mean(row, cloud[0], voxel, tolerance=1e-9)
 
 
-def test_voxel_single_voxel_holds_all_points(rng):
-    points = torch.randn(2, 40, 3, generator=rng)
+def test_voxel_single_voxel_holds_all_points(randn):
+    points = randn(2, 40, 3)
     nearest = (points - points.mean(1, keepdim=True)).norm(dim=2).argmin(1)
     assert VoxelSampler(1)(points).indices.squeeze(1).tolist() == nearest.tolist()
 
 
-def test_fullest_voxels_outlier_leaves_enough_voxels(rng):
+def test_fullest_voxels_outlier_leaves_enough_voxels(rand):
     """All points but one are within a thousandth of the bounding box's side."""
-    points = 1e-3 * torch.rand(1, 60, 3, generator=rng)
+    points = 1e-3 * rand(1, 60, 3)
     points[0, 0] = 1.0
 
     rows = fullest_voxels(points, 20)[0].tolist()

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from torch.nn import functional as F
+from torch.testing import assert_close
 
 from mops_lightning.channels import Channel, PointChannels
 from mops_lightning.nets.autoencoder import AutoEncoder
@@ -26,8 +27,8 @@ WITH_NORMALS = PointChannels(
 
 
 @pytest.fixture
-def clouds_with_normals(rng):
-    clouds = torch.randn(2, 30, 7, generator=rng)
+def clouds_with_normals(randn):
+    clouds = randn(2, 30, 7)
     clouds[..., 4:] = F.normalize(clouds[..., 4:], dim=2)
     return clouds
 
@@ -48,8 +49,8 @@ def test_pairs_have_the_coordinates_of_pairs_without_channels(clouds_with_normal
     batch = registration().make_batch(clouds_with_normals, generators())
 
     expected = without.make_batch(coordinates, generators())
-    torch.testing.assert_close(batch.points[..., :3], expected.points)
-    torch.testing.assert_close(batch.centroids, expected.centroids)
+    assert_close(batch.points[..., :3], expected.points)
+    assert_close(batch.centroids, expected.centroids)
 
 
 def test_pairs_turn_normals_with_the_target(clouds_with_normals):
@@ -60,7 +61,7 @@ def test_pairs_turn_normals_with_the_target(clouds_with_normals):
     turned_normals = clouds_with_normals[..., 4:] @ rotation.mT
     assert torch.equal(source[..., 3:], clouds_with_normals[..., 3:])
     assert torch.equal(target[..., 3], clouds_with_normals[..., 3])
-    torch.testing.assert_close(target[..., 4:], turned_normals)
+    assert_close(target[..., 4:], turned_normals)
 
 
 def test_registration_with_channels_has_finite_losses(clouds_with_normals):
@@ -74,8 +75,8 @@ def test_registration_with_channels_has_finite_losses(clouds_with_normals):
         assert loss.isfinite()
 
 
-def test_reconstruction_compares_coordinates(rng):
-    points = torch.randn(2, 40, 5, generator=rng)
+def test_reconstruction_compares_coordinates(randn):
+    points = randn(2, 40, 5)
     other_channels = points.clone()
     other_channels[..., 3:] *= -1
     net = AutoEncoder(40, 16, (8, 8), point_channels=2)
@@ -89,12 +90,12 @@ def test_reconstruction_compares_coordinates(rng):
     scores = task.scores(batch, {"first": sample})
 
     assert step.output.shape == (2, 40, 3)
-    torch.testing.assert_close(step.losses, step_of_others.losses)
-    torch.testing.assert_close(scores["first"].losses["chamfer"], step.losses["chamfer"])
+    assert_close(step.losses, step_of_others.losses)
+    assert_close(scores["first"].losses["chamfer"], step.losses["chamfer"])
 
 
-def test_segmentation_interpolates_by_coordinates(rng):
-    points = torch.randn(2, 40, 4, generator=rng)
+def test_segmentation_interpolates_by_coordinates(randn):
+    points = randn(2, 40, 4)
     scaled = points.clone()
     scaled[..., 3] *= 100
     net = HierarchicalSegmentation(3, FPSSampler, (20, 8), (8, 16, 16), 4, point_channels=1)
@@ -108,4 +109,4 @@ def test_segmentation_interpolates_by_coordinates(rng):
     logits_of_scaled = task.predict(batch_of_scaled, sample)
 
     assert logits.shape == (2, 40, 3)
-    torch.testing.assert_close(logits, logits_of_scaled)
+    assert_close(logits, logits_of_scaled)

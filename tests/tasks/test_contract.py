@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import UserError
@@ -103,12 +104,12 @@ def test_disagreement_is_divergence_of_reference_from_prediction():
     apart = task.disagreement(found.log(), reference.log() + 3)  # logits, up to a constant
 
     expected = 0.9 * math.log(0.9 / 0.5) + 0.1 * math.log(0.1 / 0.5)
-    torch.testing.assert_close(apart, torch.tensor([expected]))
+    assert_close(apart, torch.tensor([expected]))
 
 
-def test_smoothed_labels_give_every_class_a_share(rng):
+def test_smoothed_labels_give_every_class_a_share(randn):
     task = Classification(PointNetVanilla(4), 4, label_smoothing=0.2).eval()
-    points = torch.randn(3, 9, 3, generator=rng)
+    points = randn(3, 9, 3)
     labels = torch.tensor([0, 2, 3])
     batch = Batch(points, labels)
 
@@ -117,7 +118,7 @@ def test_smoothed_labels_give_every_class_a_share(rng):
     targets = 0.8 * torch.eye(4)[labels] + 0.2 / 4
     log_shares = task.predict(batch, points).log_softmax(1)
     expected = -(targets * log_shares).sum(1).mean()
-    torch.testing.assert_close(loss, expected)
+    assert_close(loss, expected)
 
 
 def test_label_smoothing_of_one_is_refused():

@@ -1,5 +1,6 @@
 import pytest
 import torch
+from torch.testing import assert_close
 
 from mops_lightning.errors import UserError
 from mops_lightning.nets.pcrnet import PCRNet
@@ -32,9 +33,9 @@ def test_pairs_target_is_moved_source(rng):
     points = clouds(rng)
     batch = pairs()(points, generators(6))
     source, target = restored(batch)
-    torch.testing.assert_close(source, points)
-    torch.testing.assert_close(target, moved(batch, source), atol=1e-5, rtol=0)
-    torch.testing.assert_close(batch.points.mean(1), torch.zeros(12, 3), atol=1e-6, rtol=0)
+    assert_close(source, points)
+    assert_close(target, moved(batch, source), atol=1e-5, rtol=0)
+    assert_close(batch.points.mean(1), torch.zeros(12, 3), atol=1e-6, rtol=0)
     assert not torch.allclose(target, source, atol=0.1)
 
 
@@ -46,8 +47,8 @@ def test_pairs_depend_on_own_generator_only(rng):
         alone = make(points[i : i + 1], generators(6)[i : i + 1])
         for name in ("quaternion", "translation"):
             assert torch.equal(getattr(alone, name)[0], getattr(together, name)[i])
-        torch.testing.assert_close(alone.points[0], together.points[i])
-        torch.testing.assert_close(alone.points[1], together.points[6 + i])
+        assert_close(alone.points[0], together.points[i])
+        assert_close(alone.points[1], together.points[6 + i])
 
 
 def rows_of(cloud, points):

@@ -2,6 +2,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from mops_lightning import FPSSampler, MOPSNet, earth_movers_distance
 from mops_lightning.errors import UserError
@@ -34,8 +35,8 @@ def test_step_loss_is_chamfer_plus_emd(rng):
     chamfer = chamfer_distance(built, given.points).mean()
     emd = earth_movers_distance(built, given.points).mean()
     assert set(losses) == {"chamfer", "emd"}
-    torch.testing.assert_close(losses["chamfer"], chamfer)
-    torch.testing.assert_close(losses["emd"], emd)
+    assert_close(losses["chamfer"], chamfer)
+    assert_close(losses["emd"], emd)
 
 
 def test_training_metrics_need_no_reference():
@@ -56,7 +57,7 @@ def test_scores_of_large_clouds_have_a_finer_assignment_than_training(rng):
 
     built = module.net(given.points)
     expected = earth_movers_distance(built, given.points, block=128, rounds=8)
-    torch.testing.assert_close(found, expected)
+    assert_close(found, expected)
     assert (found < trained).all()
     assert (earth_movers_distance(built, given.points) <= found).all()
 
@@ -95,10 +96,10 @@ def test_normalized_errors_sample_match_plain_formula(rng):
     built = module.net(chosen)
     of_all = chamfer_distance(module.net(given.points), given.points)
     ratio = chamfer_distance(built, given.points) / of_all
-    torch.testing.assert_close(values["nre_cd"], ratio.mean())
-    torch.testing.assert_close(values["chamfer"], chamfer_distance(built, given.points).mean())
+    assert_close(values["nre_cd"], ratio.mean())
+    assert_close(values["chamfer"], chamfer_distance(built, given.points).mean())
     exact = earth_movers_distance(built, given.points).mean()
-    torch.testing.assert_close(values["emd"], exact)
+    assert_close(values["emd"], exact)
 
 
 def test_scores_are_exact_up_to_a_number_of_points(rng):
@@ -109,7 +110,7 @@ def test_scores_are_exact_up_to_a_number_of_points(rng):
         scored(Reconstruction(net, exact_up_to=limit), given, given.points).predictions.emd
         for limit in (300, 299)
     )
-    torch.testing.assert_close(exact, earth_movers_distance(net(given.points), given.points))
+    assert_close(exact, earth_movers_distance(net(given.points), given.points))
     assert approximate > exact + 1e-5
 
 

@@ -1,5 +1,6 @@
 import torch
 from scipy.spatial.transform import Rotation
+from torch.testing import assert_close
 
 from mops_lightning import FPSSampler
 from mops_lightning.data.loader import CloudLoader
@@ -41,8 +42,8 @@ def task(net=None, **settings):
     return Registration(net or small_net(), **settings)
 
 
-def test_step_exact_net_recovers_motions(rng):
-    source = torch.randn(5, 40, 3, generator=rng) + 3  # far from its centroid
+def test_step_exact_net_recovers_motions(randn):
+    source = randn(5, 40, 3) + 3  # far from its centroid
     true = motion(1)
     batch = pair_batch(source, true.apply(source), true)
 
@@ -51,7 +52,7 @@ def test_step_exact_net_recovers_motions(rng):
     found = result.predictions
     assert torch.equal(result.targets.translation, true.translation)
     assert RotationError.of(found, true).max() < 1e-2
-    torch.testing.assert_close(found.translation, true.translation, atol=1e-4, rtol=0)
+    assert_close(found.translation, true.translation, atol=1e-4, rtol=0)
     assert sum(result.losses.values()) < 1e-3
 
 
@@ -60,7 +61,7 @@ def test_disagreement_of_shifted_motions_is_squared_shift():
     shift = torch.tensor([1.0, -2.0, 0.5])
     moved = true._replace(translation=true.translation + shift)
     apart = task().disagreement(moved, true)
-    torch.testing.assert_close(apart, torch.full_like(apart, 5.25))
+    assert_close(apart, torch.full_like(apart, 5.25))
 
 
 class RecordingSampler(FPSSampler):

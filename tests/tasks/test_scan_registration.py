@@ -3,6 +3,7 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from torch.testing import assert_close
 
 from mops_lightning.errors import UserError
 from mops_lightning.metrics.registration import RotationError
@@ -91,7 +92,7 @@ def test_residuals_without_motion_equal_a_plain_form(clouds):
     for number in range(3):
         expected = plain_residuals(aligned[number], target[number])
         found = residuals[number, 0].double()
-        torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
+        assert_close(found, expected, atol=1e-5, rtol=0)
 
 
 def test_loss_is_smallest_at_the_mean_residual(clouds):

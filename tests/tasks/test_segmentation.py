@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import nn
 from torch.nn import functional as F
+from torch.testing import assert_close
 
 from mops_lightning.data import cloud_folder as folder
 from mops_lightning.data.formats.registry import WRITERS
@@ -41,40 +42,40 @@ def plainly_interpolated(values, points, query):
     return weighted.sum(0) / weights.sum()
 
 
-def test_interpolation_equals_plain_loops(rng):
-    values = torch.rand(2, 6, 4, generator=rng)
-    points = torch.rand(2, 6, 3, generator=rng)
-    queries = torch.rand(2, 9, 3, generator=rng)
+def test_interpolation_equals_plain_loops(rand):
+    values = rand(2, 6, 4)
+    points = rand(2, 6, 3)
+    queries = rand(2, 9, 3)
 
     found = interpolate(values, points, queries)
 
     for cloud in range(2):
         for query, row in zip(queries[cloud], found[cloud], strict=True):
             expected = plainly_interpolated(values[cloud], points[cloud], query)
-            torch.testing.assert_close(row, expected, rtol=1e-4, atol=1e-5)
+            assert_close(row, expected, rtol=1e-4, atol=1e-5)
 
 
-def test_interpolation_at_the_points_returns_their_values(rng):
-    values = torch.rand(2, 6, 4, generator=rng)
-    points = torch.rand(2, 6, 3, generator=rng)
+def test_interpolation_at_the_points_returns_their_values(rand):
+    values = rand(2, 6, 4)
+    points = rand(2, 6, 3)
 
     found = interpolate(values, points, points)
 
-    torch.testing.assert_close(found, values, rtol=1e-4, atol=1e-4)
+    assert_close(found, values, rtol=1e-4, atol=1e-4)
 
 
-def test_interpolation_from_a_single_point_keeps_its_shape(rng):
-    values = torch.rand(2, 1, 4, generator=rng)
-    points = torch.rand(2, 1, 3, generator=rng)
-    queries = torch.rand(2, 9, 3, generator=rng)
+def test_interpolation_from_a_single_point_keeps_its_shape(rand):
+    values = rand(2, 1, 4)
+    points = rand(2, 1, 3)
+    queries = rand(2, 9, 3)
 
     assert interpolate(values, points, queries).shape == (2, 9, 4)
 
 
-def test_interpolation_gradients_equal_differences(rng):
-    values = torch.rand(1, 6, 4, generator=rng, dtype=torch.float64, requires_grad=True)
-    points = torch.rand(1, 6, 3, generator=rng, dtype=torch.float64, requires_grad=True)
-    queries = torch.rand(1, 9, 3, generator=rng, dtype=torch.float64, requires_grad=True)
+def test_interpolation_gradients_equal_differences(rand):
+    values = rand(1, 6, 4, dtype=torch.float64, requires_grad=True)
+    points = rand(1, 6, 3, dtype=torch.float64, requires_grad=True)
+    queries = rand(1, 9, 3, dtype=torch.float64, requires_grad=True)
 
     assert torch.autograd.gradcheck(interpolate, (values, points, queries))
 
@@ -89,9 +90,9 @@ def iou(predictions, parts, part):
 
 
 @pytest.fixture
-def halves(rng):
+def halves(randn):
     """Clouds with two halves, x above 0 and below."""
-    points = torch.randn(3, 200, 3, generator=rng)
+    points = randn(3, 200, 3)
     parts = (points[..., 0] > 0).long()
     labels = torch.zeros(3, dtype=torch.int64)
     return Batch(points, labels, parts=parts)
@@ -131,7 +132,7 @@ def test_prediction_of_a_copy_of_the_points_is_the_same(halves):
     same = task.predict(halves, halves.points)
     copy = task.predict(halves, halves.points.clone())
 
-    torch.testing.assert_close(same, copy, atol=1e-2, rtol=1e-4)
+    assert_close(same, copy, atol=1e-2, rtol=1e-4)
 
 
 def test_segmentation_without_parts_is_refused(halves):
@@ -147,9 +148,9 @@ def test_segmentation_into_one_part_is_refused():
         Segmentation(Halves(), 1)
 
 
-def test_points_of_unknown_part_are_neither_learned_nor_scored(rng):
-    points = torch.randn(2, 99, 3, generator=rng)
-    known = torch.rand(2, 99, generator=rng) > 0.3
+def test_points_of_unknown_part_are_neither_learned_nor_scored(randn, rand):
+    points = randn(2, 99, 3)
+    known = rand(2, 99) > 0.3
     parts = (points[..., 1] > 0).long()
     labels = torch.zeros(2).long()
     some_known = Batch(points, labels, parts=parts.where(known, UNKNOWN))
@@ -161,29 +162,29 @@ def test_points_of_unknown_part_are_neither_learned_nor_scored(rng):
 
     logits = task.predict(some_known, points)
     loss = F.cross_entropy(logits[known], parts[known])
-    torch.testing.assert_close(found.losses["cross_entropy"], loss)
+    assert_close(found.losses["cross_entropy"], loss)
     scores = task.metrics()(found.predictions, found.targets)
     scores_of_known = task.metrics()(found.predictions[known], parts[known])
     assert scores == scores_of_known
     assert nothing.losses["cross_entropy"] == 0
 
 
-def test_net_follows_order_of_points(rng):
+def test_net_follows_order_of_points(rng, randn):
     net = HierarchicalSegmentation(5, FPSSampler, (20, 8), (8, 16, 16), 4).eval()
-    points = torch.randn(2, 40, 3, generator=rng)
+    points = randn(2, 40, 3)
     order = torch.randperm(40, generator=rng)
 
     logits = net(points)
     logits_in_order = net(points[:, order])
 
     assert logits.shape == (2, 40, 5)
-    torch.testing.assert_close(logits_in_order, logits[:, order], atol=1e-4, rtol=1e-4)
+    assert_close(logits_in_order, logits[:, order], atol=1e-4, rtol=1e-4)
     assert net(points[:, :3]).shape == (2, 3, 5)
 
 
-def test_net_trains_every_weight(rng):
+def test_net_trains_every_weight(randn):
     net = HierarchicalSegmentation(5, FPSSampler, (20, 8), (8, 16, 16), 4).train()
-    points = torch.randn(2, 40, 3, generator=rng)
+    points = randn(2, 40, 3)
 
     net(points).square().sum().backward()
 
@@ -220,11 +221,11 @@ def test_shapes_know_their_parts(tmp_path):
 
 
 @pytest.fixture(params=[".ply", ".npz"])
-def scans(request, tmp_path, rng):
+def scans(request, tmp_path, rand):
     """A folder of two scans, whose columns ``kind`` hold other numbers left and right."""
     suffix = request.param
     for number, kinds in enumerate(([7, 2], [2, 40])):
-        points = torch.rand(60, 3, generator=rng).double().numpy()
+        points = rand(60, 3).double().numpy()
         kind = np.where(points[:, 0] > 0.5, *kinds).astype(np.int16)
         kind[::4] = -1 - number
         WRITERS[suffix](tmp_path / f"scan{number}{suffix}", Table(points, {"kind": kind}))

@@ -40,8 +40,8 @@ def marked_in_column(image, number, columns, name):
     return marked(column_of(image, number, columns), name)
 
 
-def test_cloud_grid_draws_readout_in_its_colour(tmp_path, rng):
-    points = torch.rand(2, 300, 3, generator=rng)
+def test_cloud_grid_draws_readout_in_its_colour(tmp_path, rand):
+    points = rand(2, 300, 3)
     samples = points[:, :20]
     readouts = {"generated": samples, "matched": samples, "completed": samples}
 
@@ -53,8 +53,8 @@ def test_cloud_grid_draws_readout_in_its_colour(tmp_path, rng):
     assert marked_in_column(image, 3, 4, "completed") > 200
 
 
-def test_cloud_grid_names_clouds_and_readouts(rng):
-    points = torch.rand(2, 300, 3, generator=rng)
+def test_cloud_grid_names_clouds_and_readouts(rand):
+    points = rand(2, 300, 3)
 
     figure = figures.cloud_grid(points, {"matched": points[:, :20]}, ["chair", "vase"])
 
@@ -88,8 +88,8 @@ def test_matrix_figure_shows_ideal_matrix_as_diagonal_and_every_large_entry(numb
     np.testing.assert_array_equal(drawn_gram, np.eye(4))
 
 
-def test_cloud_grid_draws_samples_over_dense_cloud(tmp_path, rng):
-    points = F.normalize(torch.randn(8192, 3, generator=rng), dim=1)
+def test_cloud_grid_draws_samples_over_dense_cloud(tmp_path, randn):
+    points = F.normalize(randn(8192, 3), dim=1)
     is_far = points[:, 0] < -0.3
     far = points[is_far][:100]
     readouts = {"matched": far[None]}
@@ -103,8 +103,8 @@ def test_cloud_grid_draws_samples_over_dense_cloud(tmp_path, rng):
     assert marked_over_dense > 0.2 * marked_alone
 
 
-def test_comparison_draws_every_sample_and_whole_cloud(tmp_path, rng):
-    points = torch.rand(300, 3, generator=rng)
+def test_comparison_draws_every_sample_and_whole_cloud(tmp_path, rand):
+    points = rand(300, 3)
     sample = points[:20]
     captions = {
         "fps": "fps: 78.75 %",
@@ -137,8 +137,8 @@ def test_save_figure_png_has_a_palette_near_the_colours(tmp_path):
         assert distances.min() < 0.02
 
 
-def test_save_clouds_large_thins_input_and_keeps_samples(tmp_path, rng):
-    points = torch.rand(2, 20_000, 3, generator=rng)
+def test_save_clouds_large_thins_input_and_keeps_samples(tmp_path, rand):
+    points = rand(2, 20_000, 3)
     samples = points[:, :4096]
     path = tmp_path / "clouds.npz"
 
@@ -166,9 +166,9 @@ DAMAGES: dict[str, dict[str, np.ndarray]] = {
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_load_clouds_damaged_file_is_refused(tmp_path, rng, damage):
+def test_load_clouds_damaged_file_is_refused(tmp_path, rand, damage):
     path = tmp_path / "clouds.npz"
-    points = torch.rand(2, 50, 3, generator=rng)
+    points = rand(2, 50, 3)
     figures.save_clouds(path, points, {"generated": points[:, :4]}, ["a", "b"])
     arrays = {**np.load(path), **DAMAGES[damage]}
     if damage == "no samples":
@@ -183,9 +183,9 @@ def test_load_clouds_damaged_file_is_refused(tmp_path, rng, damage):
         figures.load_clouds(path)
 
 
-def test_reconstruction_grid_thins_large_clouds_only(rng):
+def test_reconstruction_grid_thins_large_clouds_only(rand):
     most = figures.MAX_INPUT_POINTS
-    points = torch.rand(1, 2 * most, 3, generator=rng)
+    points = rand(1, 2 * most, 3)
     result = ReconstructionResult(points[:, :8], points[:, :100], [1.5])
 
     figure = reconstruction_grid(points, points, {"fps": result}, ["chair"])
@@ -275,8 +275,8 @@ BRIGHT = np.array([253, 231, 37]) / 255
 DARK = np.array([68, 1, 84]) / 255
 
 
-def test_cloud_grid_draws_points_in_the_colours_of_a_channel(tmp_path, rng):
-    points = torch.rand(1, 300, 4, generator=rng)
+def test_cloud_grid_draws_points_in_the_colours_of_a_channel(tmp_path, rand):
+    points = rand(1, 300, 4)
     is_above = points[..., 1] > 0.5
     points[..., 3] = is_above.float()  # bright above, dark below
     readouts = {"sampled": points[:, :40]}
