@@ -20,11 +20,10 @@ def test_subset_loss_equals_double_loop(randn):
 
     loss = loss_of(samples)
 
-    nearest = []
+    distances = []
     for cloud, sample in zip(points, samples, strict=True):
-        for q in sample:
-            nearest.append(min(squared(q, p) for p in cloud))
-    expected = torch.stack(nearest).mean()
+        distances += plain_nearest(sample, cloud)
+    expected = torch.stack(distances).mean()
     assert_close(loss, expected)
     gradient = torch.autograd.grad(loss, samples)
     expected_gradient = torch.autograd.grad(expected, samples)
@@ -41,22 +40,32 @@ def plain_simplification_loss(points, samples, coverage, per_point):
     """The loss as published, one number at a time."""
     total = 0.0
     for cloud, sample in zip(points, samples, strict=True):
-        to_cloud = plain_nearest(sample, cloud)
-        from_cloud = plain_nearest(cloud, sample)
+        to_cloud = [float(distance) for distance in plain_nearest(sample, cloud)]
+        from_cloud = [float(distance) for distance in plain_nearest(cloud, sample)]
         weight = coverage + per_point * len(sample)
-        total += mean(to_cloud) + max(to_cloud) + weight * mean(from_cloud)
+        total += mean(to_cloud)
+        total += max(to_cloud)
+        total += weight * mean(from_cloud)
     return total / len(points)
 
 
 def plain_nearest(points, others):
     """Return the squared distance of each point to the nearest of the others."""
-    distances = []
-    for q in points:
-        distances.append(min(float(squared(q, p)) for p in others))
-    return distances
+    nearest = []
+    for point in points:
+        distances = [squared(point, other) for other in others]
+        nearest.append(min(distances))
+    return nearest
 
 
-@pytest.mark.parametrize(("coverage", "per_point"), [(1.0, 0.0), (0.5, 1 / 30), (0.0, 1 / 64)])
+@pytest.mark.parametrize(
+    ("coverage", "per_point"),
+    [
+        (1.0, 0.0),
+        (0.5, 1 / 30),
+        (0.0, 1 / 64),
+    ],
+)
 def test_simplification_loss_equals_double_loop(coverage, per_point, randn):
     points = randn(3, 17, 3)
     samples = randn(3, 5, 3)
@@ -69,20 +78,26 @@ def test_simplification_loss_equals_double_loop(coverage, per_point, randn):
 
 @pytest.mark.parametrize(
     ("losses", "loss", "weights"),
-    [(subset_losses, subset_loss, ()), (simplification_losses, simplification_loss, (0.5, 0.1))],
+    [
+        (subset_losses, subset_loss, ()),
+        (simplification_losses, simplification_loss, (0.5, 0.1)),
+    ],
 )
 def test_losses_of_several_sizes_equal_each_size(losses, loss, weights, randn):
     points = randn(3, 30, 3, dtype=torch.float64)
     samples = randn(3, 12, 3, dtype=torch.float64, requires_grad=True)
     sizes = (12, 1, 5)
+
     together = losses(points, samples, sizes, *weights)
+
     assert set(together) == set(sizes)
     for m in sizes:
-        alone = loss(points, samples[:, :m].clone(), *weights)
+        first = samples[:, :m].clone()
+        alone = loss(points, first, *weights)
         assert_close(together[m], alone)
-        (got,) = torch.autograd.grad(together[m], samples, retain_graph=True)
-        (want,) = torch.autograd.grad(alone, samples)
-        assert_close(got, want)
+        gradient = torch.autograd.grad(together[m], samples, retain_graph=True)
+        gradient_alone = torch.autograd.grad(alone, samples)
+        assert_close(gradient, gradient_alone)
 
 
 def test_simplification_loss_has_weights_of_one_and_zero_by_default(randn):
@@ -108,8 +123,8 @@ def plain_overlap(matrix, m):
 
 @pytest.mark.parametrize("per_cloud", [False, True])
 def test_overlap_losses_equal_loop_over_pairs(per_cloud, randn):
-    shape = (3, 7, 5) if per_cloud else (7, 5)
-    queries = randn(shape, dtype=torch.float64, requires_grad=True)
+    clouds = (3,) if per_cloud else ()
+    queries = randn(*clouds, 7, 5, dtype=torch.float64, requires_grad=True)
     keys = randn(3, 20, 5, dtype=torch.float64, requires_grad=True)
     matrix = SamplingMatrix(queries, keys, 0.3)
 

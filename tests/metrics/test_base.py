@@ -74,38 +74,64 @@ def test_metric_documents_itself(metric):
 
 def batch(metric):
     """What a metric is updated with."""
-    turned = torch.nn.functional.normalize(torch.tensor([[1.0, 0.01, 0, 0]]))
-    still = torch.eye(4)[:1]
-    return {
-        "classification": (torch.eye(3), torch.tensor([0, 1, 1])),
-        "reconstruction": tuple(Distances(torch.rand(3), torch.rand(3)) for _ in range(2)),
-        "registration": (Motion(turned, torch.rand(1, 3)), Motion(still, torch.rand(1, 3))),
+    quaternion = torch.tensor([[1.0, 0.01, 0, 0]])
+    turned = Motion(F.normalize(quaternion), torch.rand(1, 3))
+    still = Motion(torch.eye(4)[:1], torch.rand(1, 3))
+    distances = Distances(torch.rand(3), torch.rand(3))
+    reference = Distances(torch.rand(3), torch.rand(3))
+    logits = torch.eye(3)
+    labels = torch.tensor([0, 1, 1])
+    given = {
+        "classification": (logits, labels),
+        "reconstruction": (distances, reference),
+        "registration": (turned, still),
         "sampled_set": (torch.rand(3),),
-    }[metric.__module__.rpartition(".")[2]]
+    }
+    module = metric.__module__.rpartition(".")[2]
+    return given[module]
 
 
 @pytest.mark.parametrize("metric", METRICS)
 def test_metric_of_two_processes_with_equal_data_equals_that_of_one(metric):
-    classes = (3,) if metric.__module__ == classification.__name__ else ()
+    def state_of_both_processes(state, group=None):
+        return [state, state]
+
+    def is_distributed():
+        return True
+
+    classes = ()
+    if metric.__module__ == classification.__name__:
+        classes = (3,)
     alone = metric(*classes)
-    gather = {"dist_sync_fn": lambda state, group=None: [state, state]}
-    shared = metric(*classes, **gather, distributed_available_fn=lambda: True)
+    shared = metric(
+        *classes,
+        dist_sync_fn=state_of_both_processes,
+        distributed_available_fn=is_distributed,
+    )
     given = batch(metric)
-    for one in (alone, shared):
-        one.update(*given)
-    assert_close(shared.compute(), alone.compute())
-    assert alone.compute() > 0
+
+    alone.update(*given)
+    shared.update(*given)
+
+    value = alone.compute()
+    assert_close(shared.compute(), value)
+    assert value > 0
 
 
 def test_collection_metrics_equal_after_first_batch_stay_apart():
-    turned = torch.tensor([[0.0, 1.0, 0.0, 0.0]])
-    still, half_turn = (Motion(q, torch.zeros(1, 3)) for q in (torch.eye(4)[:1], turned))
+    no_shift = torch.zeros(1, 3)
+    still = Motion(torch.tensor([[1.0, 0.0, 0.0, 0.0]]), no_shift)
+    half_turn = Motion(torch.tensor([[0.0, 1.0, 0.0, 0.0]]), no_shift)
     metrics = collection(RotationError(), TranslationError(), TwiceTheError())
-    for predicted in (still, half_turn):
-        metrics.update(predicted, still)
-    found = {name: value.item() for name, value in metrics.compute().items()}
-    expected = {"rotation_error_deg": 90, "translation_error": 0, "twice": 180}
-    assert found == pytest.approx(expected, abs=1e-3)
+
+    metrics.update(still, still)
+    metrics.update(half_turn, still)
+
+    found = metrics.compute()
+    assert set(found) == {"rotation_error_deg", "translation_error", "twice"}
+    assert found["rotation_error_deg"] == pytest.approx(90, abs=1e-3)
+    assert found["translation_error"] == pytest.approx(0, abs=1e-3)
+    assert found["twice"] == pytest.approx(180, abs=1e-3)
 
 
 class TwiceTheError(TranslationError):
@@ -118,12 +144,16 @@ class TwiceTheError(TranslationError):
 
 
 def test_accuracy_over_batches_matches_hand_computed_value():
-    labels, answers = torch.tensor([[0, 0, 0, 1, 2, 2], [0, 0, 1, 1, 2, 0]])
+    labels = torch.tensor([0, 0, 0, 1, 2, 2])
+    answers = torch.tensor([0, 0, 1, 1, 2, 0])
     logits = F.one_hot(answers, 3).float()
-    metrics = (Accuracy(3), MeanClassAccuracy(3))
-    for metric in metrics:
+    accuracy = Accuracy(3)
+    mean_class = MeanClassAccuracy(3)
+
+    for metric in (accuracy, mean_class):
         metric.update(logits[:2], labels[:2])
         metric.update(logits[2:], labels[2:])
-    accuracy, mean_class = (metric.compute().item() for metric in metrics)
-    assert accuracy == pytest.approx(4 / 6)
-    assert mean_class == pytest.approx((2 / 3 + 1 + 1 / 2) / 3)
+
+    mean_of_classes = (2 / 3 + 1 + 1 / 2) / 3
+    assert accuracy.compute() == pytest.approx(4 / 6)
+    assert mean_class.compute() == pytest.approx(mean_of_classes)

@@ -1,13 +1,15 @@
-from typing import Any
-
 import pytest
 import torch
 
 from mops_lightning.metrics import reconstruction
 from mops_lightning.metrics.reconstruction import Distances
 
-FOUND: Any = Distances(torch.tensor([2.0, 3.0, 0.0]), torch.tensor([1.0, 1.0, 0.0]))
-FULL: Any = Distances(torch.tensor([1.0, 6.0, 0.0]), torch.tensor([0.5, 1.0, 0.0]))
+CHAMFER = torch.tensor([2.0, 3.0, 0.0])
+CHAMFER_OF_FULL = torch.tensor([1.0, 6.0, 0.0])
+EMD = torch.tensor([1.0, 1.0, 0.0])
+EMD_OF_FULL = torch.tensor([0.5, 1.0, 0.0])
+FIRST_BATCH = slice(0, 1)
+SECOND_BATCH = slice(1, 3)
 
 
 @pytest.mark.parametrize(
@@ -23,6 +25,10 @@ FULL: Any = Distances(torch.tensor([1.0, 6.0, 0.0]), torch.tensor([0.5, 1.0, 0.0
 )
 def test_metric_over_batches_matches_hand_computed_value(metric, value):
     module = metric()
-    for part in (slice(0, 1), slice(1, 3)):
-        module.update(*(Distances(one.chamfer[part], one.emd[part]) for one in (FOUND, FULL)))
+
+    for batch in (FIRST_BATCH, SECOND_BATCH):
+        found = Distances(CHAMFER[batch], EMD[batch])
+        full = Distances(CHAMFER_OF_FULL[batch], EMD_OF_FULL[batch])
+        module.update(found, full)
+
     assert module.compute().item() == pytest.approx(value)

@@ -8,7 +8,8 @@ from mops_lightning.ops.rigid import Motion
 
 
 def motions(rotation, translation=None):
-    quaternion = torch.from_numpy(np.roll(rotation.as_quat(), 1, axis=1).copy()).float()
+    scalar_first = rotation.as_quat(scalar_first=True)
+    quaternion = torch.from_numpy(scalar_first).float()
     if translation is None:
         translation = torch.zeros(len(quaternion), 3)
     return Motion(quaternion, translation)
@@ -16,11 +17,21 @@ def motions(rotation, translation=None):
 
 def in_batches(metric, predicted, true):
     for start in range(0, len(true.quaternion), 7):
-        stop = start + 7
-        predicted_batch = Motion(*(part[start:stop] for part in predicted))
-        true_batch = Motion(*(part[start:stop] for part in true))
+        rows = slice(start, start + 7)
+        predicted_batch = rows_of(predicted, rows)
+        true_batch = rows_of(true, rows)
         metric.update(predicted_batch, true_batch)
     return metric.compute().item()
+
+
+def rows_of(motion, rows):
+    return Motion(motion.quaternion[rows], motion.translation[rows])
+
+
+def angles_between(predicted, true):
+    """Return the angles of scipy's rotations, in degrees."""
+    difference = predicted.inv() * true
+    return np.degrees(difference.magnitude())
 
 
 def recall(limit):
@@ -33,7 +44,7 @@ def recall(limit):
 def test_rotation_errors_match_scipy():
     predicted = Rotation.random(40, random_state=1)
     true = Rotation.random(40, random_state=2)
-    angles = np.degrees((predicted.inv() * true).magnitude())
+    angles = angles_between(predicted, true)
     given = (motions(predicted), motions(true))
 
     mean = in_batches(registration.RotationError(), *given)
@@ -52,7 +63,7 @@ def test_recall_matches_scipy(limit):
 
     share = in_batches(recall(limit), motions(predicted), motions(true))
 
-    angles = np.degrees((predicted.inv() * true).magnitude())
+    angles = angles_between(predicted, true)
     assert share == pytest.approx((angles <= limit).mean())
 
 

@@ -20,6 +20,11 @@ from mops_lightning.nets.pointnet import PointNetTransform, PointNetVanilla, Tra
 from mops_lightning.samplers.fps import FPSSampler
 from tests.support.mixed import mixed
 
+
+def small_hierarchical_net() -> HierarchicalNet:
+    return HierarchicalNet(5, FPSSampler, points=(20, 8), channels=(8, 16, 16), k=4)
+
+
 NETS = {
     "autoencoder": lambda n: AutoEncoder(n, 16, (8, 8)),
     "foldingnet": lambda n: MFoldingNet(n, 1, 16, fold_channels=(32, 8)),
@@ -30,7 +35,7 @@ CLASSIFIERS = {
     "pointnet": lambda _: PointNetVanilla(5),
     "pointnet_transform": lambda _: PointNetTransform(5),
     "dgcnn": lambda _: DGCNN(5),
-    "hierarchical": lambda _: HierarchicalNet(5, FPSSampler, (20, 8), (8, 16, 16), 4),
+    "hierarchical": lambda _: small_hierarchical_net(),
 }
 ALL = {**NETS, **CLASSIFIERS}
 
@@ -73,12 +78,16 @@ def test_all_parameters_have_gradients(name, randn):
 def test_mixed_precision_is_close_with_finite_gradients(name, randn):
     net = ALL[name](50).eval()
     points = randn(8, 60, 3)
+
     single = net(points)
     half = mixed(net, points)
+    half.square().sum().backward()
+
     assert half.dtype == torch.float32
     assert_close(half, single, rtol=0.05, atol=0.05)
-    half.square().sum().backward()
-    assert all(p.grad is not None and p.grad.isfinite().all() for p in net.parameters())
+    for weights in net.parameters():
+        assert weights.grad is not None
+        assert weights.grad.isfinite().all()
 
 
 @pytest.mark.parametrize("name", ["foldingnet", "mfoldingnet", "atlasnet"])
@@ -86,9 +95,13 @@ def test_mixed_precision_is_close_with_finite_gradients(name, randn):
 def test_number_of_points_is_variable(name, n, randn):
     net = NETS[name](50).eval()
     points = randn(2, 40, 3)
-    assert net(points, n).shape == (2, n, 3)
+
+    asked = net(points, n)
     net.n_points = n
-    assert_close(net(points), net(points, n))
+    by_default = net(points)
+
+    assert asked.shape == (2, n, 3)
+    assert_close(by_default, asked)
 
 
 @pytest.mark.parametrize("name", NETS)
@@ -113,17 +126,24 @@ def test_result_follows_from_maxima_of_point_features(name, randn):
     ],
 )
 def test_net_has_published_layers(net, channels):
-    found = [tuple(m.weight.shape) for m in net.modules() if isinstance(m, torch.nn.Linear)]
-    assert found == [(b, a) for a, b in pairwise(channels)]
+    found = []
+    for module in net.modules():
+        if isinstance(module, torch.nn.Linear):
+            found.append((module.in_features, module.out_features))
+    assert found == list(pairwise(channels))
 
 
 def test_autoencoder_has_published_size():
-    megabytes = 4e-6 * sum(p.numel() for p in AutoEncoder().parameters())
+    sizes = [weights.numel() for weights in AutoEncoder().parameters()]
+    megabytes = 4e-6 * sum(sizes)
     assert megabytes == pytest.approx(4.1, abs=0.2)
 
 
 def test_point_features_global_is_maximum_of_local(randn):
-    local, global_ = PointFeatures(PointMLP([3, 8, 6])).eval()(randn(2, 30, 3))
+    features = PointFeatures(PointMLP([3, 8, 6])).eval()
+
+    local, global_ = features(randn(2, 30, 3))
+
     assert local.shape == (2, 30, 6)
     assert_close(global_, local.max(1).values)
 
@@ -163,7 +183,21 @@ def test_invalid_argument_raises(make, message):
 def test_atlasnet_is_random_in_training_only(randn):
     net = AtlasNet(50, 3, 16, (32, 8))
     points = randn(2, 40, 3)
-    assert not torch.equal(net(points), net(points))
+
+    trained = net(points)
+    trained_again = net(points)
     net.eval()
-    assert torch.equal(net(points), net(points))
-    assert len({id(parameter) for parameter in net.patches.parameters()}) == 3 * 10
+    tested = net(points)
+    tested_again = net(points)
+
+    assert not torch.equal(trained, trained_again)
+    assert torch.equal(tested, tested_again)
+
+
+def test_atlasnet_has_a_decoder_of_its_own_for_each_piece():
+    net = AtlasNet(50, 3, 16, (32, 8))
+
+    parameters = list(net.patches.parameters())
+
+    different = {id(parameter) for parameter in parameters}
+    assert len(different) == 3 * 10

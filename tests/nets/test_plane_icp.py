@@ -14,12 +14,17 @@ from tests.ops.test_stability import box
 @pytest.fixture
 def pair():
     """Two samples of one box, and the motion between them."""
-    source = torch.from_numpy(box(600, seed=1))[None] / 4
-    target = torch.from_numpy(box(600, seed=2))[None] / 4
+    source = box_of_points(seed=1)
+    target = box_of_points(seed=2)
     turn = torch.tensor([[0.05, -0.1, 0.08]])
     shift = torch.tensor([[0.03, 0.0, -0.02]])
     true = motion_of_vectors(turn, shift)
-    return source.float(), true.apply(target.float()), true
+    return source, true.apply(target), true
+
+
+def box_of_points(seed):
+    points = box(600, seed) / 4
+    return torch.from_numpy(points).float()[None]
 
 
 def random_system(rng, number):
@@ -54,51 +59,62 @@ def test_icp_finds_the_motion_between_two_samples_of_a_box(pair):
 
     found = PlaneICP()(source, target)
 
-    assert torch.rad2deg(rotation_angle(found.quaternion, true.quaternion)) < 0.5
+    angle = rotation_angle(found.quaternion, true.quaternion)
+    assert torch.rad2deg(angle) < 0.5
     assert_close(found.translation, true.translation, atol=0.005, rtol=0)
 
 
 def test_icp_ends_where_small_gicp_ends(pair):
     small_gicp = pytest.importorskip("small_gicp")
     source, target, _ = pair
-    known = small_gicp.align(
-        target[0].double().numpy(),
-        source[0].double().numpy(),
+    source_cloud = source[0].double().numpy()
+    target_cloud = target[0].double().numpy()
+    result = small_gicp.align(
+        target_cloud,
+        source_cloud,
         registration_type="PLANE_ICP",
         downsampling_resolution=1e-6,
         max_correspondence_distance=0.3,
         max_iterations=60,
-    ).T_target_source
+    )
+    rotation = result.T_target_source[:3, :3]
+    translation = result.T_target_source[:3, 3]
 
-    found = PlaneICP(40)(source, target)
+    (found,) = PlaneICP(40)(source, target).apply(source)
 
-    moved = source[0].double().numpy() @ known[:3, :3].T + known[:3, 3]
-    assert found.apply(source)[0].numpy() == pytest.approx(moved, abs=0.005)
+    expected = source_cloud @ rotation.T + translation
+    assert found.numpy() == pytest.approx(expected, abs=0.005)
 
 
 def test_points_beyond_the_distance_have_no_effect(pair):
     source, target, _ = pair
-    far = torch.cat([source, source[:, :50] + 40], 1)
+    far_points = source[:, :50] + 40
+    source_with_far_points = torch.cat([source, far_points], 1)
+
+    found = PlaneICP()(source_with_far_points, target)
 
     expected = PlaneICP()(source, target)
-
-    assert_close(PlaneICP()(far, target).quaternion, expected.quaternion)
+    assert_close(found.quaternion, expected.quaternion)
 
 
 def test_gradients_of_the_last_step_reach_the_source(pair):
     source, target, _ = pair
     source.requires_grad_()
 
-    PlaneICP(3)(source, target).quaternion[:, 1:].sum().backward()
+    motion = PlaneICP(3)(source, target)
+    motion.quaternion[:, 1:].sum().backward()
 
     assert torch.isfinite(source.grad).all()
     assert source.grad.abs().sum() > 0
 
 
 def test_normals_of_a_plane_are_its_direction():
-    plane = torch.rand(1, 50, 3) * torch.tensor([1.0, 1.0, 0.0])
+    plane = torch.rand(1, 50, 3)
+    plane[..., 2] = 0
 
-    assert surface_normals(plane)[0, :, 2].abs().numpy() == pytest.approx(1)
+    (normals,) = surface_normals(plane)
+
+    assert normals[:, 2].abs().numpy() == pytest.approx(1)
 
 
 def test_nearest_rows_of_moved_points_are_the_points_themselves(rand):
@@ -106,7 +122,8 @@ def test_nearest_rows_of_moved_points_are_the_points_themselves(rand):
 
     rows, distance = nearest_rows(points + 1e-4, points)
 
-    assert rows.tolist() == [list(range(40))] * 2
+    every_row = list(range(40))
+    assert rows.tolist() == [every_row, every_row]
     assert distance.max() < 1e-3
 
 

@@ -8,7 +8,15 @@ from tests.support.plain import plain_farthest
 
 @pytest.mark.usefixtures("farthest_form")
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize(("n", "m"), [(1, 1), (20, 20), (32, 7), (75, 30)])
+@pytest.mark.parametrize(
+    ("n", "m"),
+    [
+        (1, 1),
+        (20, 20),
+        (32, 7),
+        (75, 30),
+    ],
+)
 def test_fps_equals_double_loop(n, m, dtype, rng, randn):
     points = randn(3, n, 3, dtype=dtype)
     start = torch.randint(n, (3,), generator=rng)
@@ -16,13 +24,22 @@ def test_fps_equals_double_loop(n, m, dtype, rng, randn):
     indices = farthest_point_sample(points, m, start=start)
 
     assert indices.dtype == torch.int64
-    for cloud, first, chosen in zip(points, start, indices, strict=True):
-        expected = plain_farthest(cloud, [int(first)], m)
+    for cloud, first, chosen in zip(points, start.tolist(), indices, strict=True):
+        expected = plain_farthest(cloud, [first], m)
         assert chosen.tolist() == expected
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-@pytest.mark.parametrize(("n", "m"), [(1, 1), (37, 37), (1024, 512), (10_000, 40), (20_000, 9)])
+@pytest.mark.parametrize(
+    ("n", "m"),
+    [
+        (1, 1),
+        (37, 37),
+        (1024, 512),
+        (10_000, 40),
+        (20_000, 9),
+    ],
+)
 @pytest.mark.parametrize("grid", [False, True])  # a grid has many ties and copies
 def test_fps_on_a_gpu_is_that_of_a_cpu(n, m, grid, rng, randn):
     points = randn(3, n, 3)
@@ -37,7 +54,15 @@ def test_fps_on_a_gpu_is_that_of_a_cpu(n, m, grid, rng, randn):
 
 
 @pytest.mark.usefixtures("farthest_form")
-@pytest.mark.parametrize(("n", "m"), [(1, 1), (20, 20), (75, 30), (3000, 9)])
+@pytest.mark.parametrize(
+    ("n", "m"),
+    [
+        (1, 1),
+        (20, 20),
+        (75, 30),
+        (3000, 9),
+    ],
+)
 def test_fps_multiplies_distances_by_weights(n, m, randn, rand):
     points = randn(3, n, 3, dtype=torch.float64)
     weight = rand(3, n).square() * 100
@@ -56,23 +81,35 @@ def test_fps_multiplies_distances_by_weights(n, m, randn, rand):
 def test_fps_equal_weights_change_nothing(rng):
     points = torch.randint(0, 9, (2, 5000, 3), generator=rng).float()  # many ties and copies
     weight = torch.full((2, 5000), 0.3)
+
+    weighted = farthest_point_sample(points, 400, weight=weight)
+
     unweighted = farthest_point_sample(points, 400)
-    assert torch.equal(farthest_point_sample(points, 400, weight=weight), unweighted)
+    assert torch.equal(weighted, unweighted)
 
 
 def test_fps_start_is_given_or_zero(randn):
     points = randn(4, 30, 3)
-    assert farthest_point_sample(points, 3, start=7)[:, 0].tolist() == [7] * 4
-    assert farthest_point_sample(points, 3)[:, 0].tolist() == [0] * 4
+
+    from_seven = farthest_point_sample(points, 3, start=7)
+    by_default = farthest_point_sample(points, 3)
+
+    assert from_seven[:, 0].tolist() == [7, 7, 7, 7]
+    assert by_default[:, 0].tolist() == [0, 0, 0, 0]
 
 
 @pytest.mark.usefixtures("farthest_form")
 def test_fps_of_coincident_points_is_distinct():
     points = torch.zeros(2, 40, 3)
     points[1, 10:20] = 1.0
+
     indices = farthest_point_sample(points, 40, start=3)
-    assert indices.sort(1).values.tolist() == [list(range(40))] * 2
-    assert indices[1, 1] == 10  # the lowest of the farthest
+
+    every_row = list(range(40))
+    first, second = indices.tolist()
+    assert sorted(first) == every_row
+    assert sorted(second) == every_row
+    assert second[1] == 10  # the lowest of the farthest
 
 
 @pytest.mark.parametrize(
@@ -112,6 +149,11 @@ def test_fill_equals_double_loop(randn, rand):
 
 def test_fill_of_points_with_gradients_equals_fill_without(randn):
     points = randn(2, 40, 3)
-    indices, given = torch.arange(10).expand(2, -1), torch.tensor([2, 5])
-    filled = farthest_point_fill(points.clone().requires_grad_(), indices, given)
-    assert torch.equal(filled, farthest_point_fill(points, indices, given))
+    points_with_gradients = points.clone().requires_grad_()
+    indices = torch.arange(10).expand(2, -1)
+    given = torch.tensor([2, 5])
+
+    filled = farthest_point_fill(points_with_gradients, indices, given)
+
+    expected = farthest_point_fill(points, indices, given)
+    assert torch.equal(filled, expected)

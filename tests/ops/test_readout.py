@@ -1,5 +1,3 @@
-import re
-
 import pytest
 import torch
 from scipy.spatial import cKDTree
@@ -17,25 +15,32 @@ def test_match_equals_kd_tree(dtype, randn):
     matched = match(generated, points)
 
     for cloud, sample, rows in zip(points, generated, matched, strict=True):
-        _, expected = cKDTree(cloud.numpy()).query(sample.numpy())
+        _, expected = cKDTree(cloud).query(sample)
         assert rows.tolist() == expected.tolist()
 
 
 def test_match_has_no_gradients(randn):
     points = randn(1, 9, 3, requires_grad=True)
-    assert not match(points, points).requires_grad
+
+    rows = match(points, points)
+
+    assert not rows.requires_grad
 
 
 def test_unique_count_equals_sets(rng):
     indices = torch.randint(12, (6, 10), generator=rng)
     indices[0] = 5
     indices[1] = torch.arange(10)
-    assert unique_count(indices).tolist() == [len(set(row)) for row in indices.tolist()]
+
+    counts = unique_count(indices)
+
+    for row, count in zip(indices.tolist(), counts.tolist(), strict=True):
+        assert count == len(set(row))
 
 
-def plain_complete(indices, cloud):
-    chosen = list(dict.fromkeys(indices.tolist()))
-    return plain_farthest(cloud, chosen, len(indices))
+def plain_complete(indices, cloud, weight=None):
+    without_copies = list(dict.fromkeys(indices.tolist()))
+    return plain_farthest(cloud, without_copies, len(indices), weight)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -61,33 +66,43 @@ def test_complete_fills_up_by_weight(rng, randn, rand):
     completed = complete(indices, points, weight)
 
     for cloud in range(4):
-        chosen = list(dict.fromkeys(indices[cloud].tolist()))
-        expected = plain_farthest(points[cloud], chosen, 20, weight[cloud])
+        expected = plain_complete(indices[cloud], points[cloud], weight[cloud])
         assert completed[cloud].tolist() == expected
 
 
 def test_complete_of_coincident_points_is_distinct():
     indices = torch.tensor([[4, 4, 2, 4, 2, 0, 0, 0]])
-    assert sorted(complete(indices, torch.ones(1, 8, 3))[0].tolist()) == list(range(8))
+    points = torch.ones(1, 8, 3)
+
+    (completed,) = complete(indices, points)
+
+    assert sorted(completed.tolist()) == list(range(8))
 
 
 @pytest.mark.parametrize(
-    ("indices", "points"),
+    ("dtype", "shape_of_indices", "shape_of_points"),
     [
-        (torch.zeros(1, 2), torch.zeros(1, 3, 3)),
-        (torch.tensor([0, 1]), torch.zeros(1, 3, 3)),
-        (torch.tensor([[0, 1]]), torch.zeros(3, 3)),
-        (torch.zeros(1, 4).long(), torch.zeros(1, 3, 3)),
-        (torch.tensor([[0, 1]]), torch.zeros(2, 3, 3)),
+        (torch.float32, (1, 2), (1, 3, 3)),
+        (torch.int64, (2,), (1, 3, 3)),
+        (torch.int64, (1, 2), (3, 3)),
+        (torch.int64, (1, 4), (1, 3, 3)),
+        (torch.int64, (1, 2), (2, 3, 3)),
     ],
 )
-def test_complete_wrong_arguments_raise(indices, points):
-    shapes = f"{indices.dtype} {tuple(indices.shape)} and {tuple(points.shape)}."
-    with pytest.raises(UserError, match=rf"indices must be int64 .*got {re.escape(shapes)}"):
+def test_complete_wrong_arguments_raise(dtype, shape_of_indices, shape_of_points):
+    indices = torch.zeros(shape_of_indices, dtype=dtype)
+    points = torch.zeros(shape_of_points)
+
+    with pytest.raises(UserError, match=r"indices must be int64 .*got ") as caught:
         complete(indices, points)
+
+    assert str(caught.value).endswith(f"{dtype} {shape_of_indices} and {shape_of_points}.")
 
 
 @pytest.mark.parametrize("shape", [(4, 3), (2, 4, 3), (1, 4, 2)])
 def test_match_other_shapes_raise(shape):
+    generated = torch.zeros(shape)
+    points = torch.zeros(1, 5, 3)
+
     with pytest.raises(UserError, match=r"queries .* and points .* must agree"):
-        match(torch.zeros(shape), torch.zeros(1, 5, 3))
+        match(generated, points)

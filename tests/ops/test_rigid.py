@@ -16,8 +16,10 @@ ANGLES = (0.0, 1e-12, 1e-7, 1e-3, np.pi / 2, np.pi - 1e-7, np.pi)
 def rotations(number=200, seed=0):
     """Return random and special rotations: none, tiny, and half turns, exact and almost."""
     rng = np.random.default_rng(seed)
-    axes = np.concatenate([np.eye(3), rng.normal(size=(7, 3))])
-    unit_axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    random_axes = rng.normal(size=(7, 3))
+    axes = np.concatenate([np.eye(3), random_axes])
+    lengths = np.linalg.norm(axes, axis=1, keepdims=True)
+    unit_axes = axes / lengths
     vectors = np.concatenate([unit_axes * angle for angle in ANGLES])
     at_random = Rotation.random(number, random_state=seed)
     special = Rotation.from_rotvec(vectors)
@@ -25,8 +27,7 @@ def rotations(number=200, seed=0):
 
 
 def quaternions(rotation):
-    scalar_last = rotation.as_quat()
-    return torch.from_numpy(np.roll(scalar_last, 1, axis=-1).copy())
+    return torch.from_numpy(rotation.as_quat(scalar_first=True))
 
 
 def same_rotation(got, want, tolerance=1e-12):
@@ -66,7 +67,8 @@ def test_quaternion_from_euler_uses_fixed_axes_xyz():
 
     turned = rigid.quaternion_from_euler(torch.from_numpy(angles))
 
-    same_rotation(turned, quaternions(Rotation.from_euler("xyz", angles)))
+    expected = Rotation.from_euler("xyz", angles)
+    same_rotation(turned, quaternions(expected))
 
 
 TOLERANCES = {torch.float64: 1e-7, torch.float32: 2e-6}
@@ -74,9 +76,13 @@ TOLERANCES = {torch.float64: 1e-7, torch.float32: 2e-6}
 
 def check_angle(first, second, dtype):
     """Compare the angles between two series of rotations with SciPy's."""
-    angle = rigid.rotation_angle(quaternions(first).to(dtype), quaternions(second).to(dtype))
+    of_first = quaternions(first).to(dtype)
+    of_second = quaternions(second).to(dtype)
 
-    expected = (first.inv() * second).magnitude()
+    angle = rigid.rotation_angle(of_first, of_second)
+
+    difference = first.inv() * second
+    expected = difference.magnitude()
     assert torch.isfinite(angle).all()
     assert_close(angle, torch.from_numpy(expected).to(dtype), atol=TOLERANCES[dtype], rtol=0)
 
@@ -135,31 +141,36 @@ def test_motion_keeps_distances(randn):
     assert_close(moved.diff(dim=1).norm(dim=2), distances)
 
 
-def test_random_motion_covers_its_translations():
-    drawn = rigid.random_motion(45.0, 0.5, [generator(i) for i in range(2000)])
+def motions_of_2000_seeds():
+    generators = [generator(number) for number in range(2000)]
+    return rigid.random_motion(45.0, 0.5, generators)
 
+
+def test_random_motion_covers_its_translations():
+    drawn = motions_of_2000_seeds()
+
+    smallest = drawn.translation.amin(0)
+    largest = drawn.translation.amax(0)
     assert drawn.translation.abs().max() <= 0.5
-    assert (drawn.translation.amin(0) < -0.49).all()
-    assert (drawn.translation.amax(0) > 0.49).all()
+    assert (smallest < -0.49).all()
+    assert (largest > 0.49).all()
 
 
 def test_random_motion_covers_its_angles():
-    generators = [generator(number) for number in range(2000)]
+    drawn = motions_of_2000_seeds()
 
-    drawn = rigid.random_motion(45.0, 0.5, generators)
-
-    scalar_last = np.roll(drawn.quaternion.numpy(), -1, 1)
-    rotation = Rotation.from_quat(scalar_last)
+    rotation = Rotation.from_quat(drawn.quaternion.numpy(), scalar_first=True)
     angles = np.abs(rotation.as_euler("xyz", degrees=True))
     assert angles.max() <= 45.001
     assert (angles.max(0) > 44).all()
 
 
 def test_random_motion_has_the_mean_angle_of_its_range():
-    drawn = rigid.random_motion(45.0, 0.5, [generator(i) for i in range(2000)])
+    drawn = motions_of_2000_seeds()
     still = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(2000, 4)
 
     angles = rigid.rotation_angle(drawn.quaternion, still)
 
     # Of always predicting the identity, about 42.8 degrees.
-    assert 41.5 < torch.rad2deg(angles).mean() < 44
+    mean_angle = torch.rad2deg(angles).mean()
+    assert 41.5 < mean_angle < 44

@@ -34,7 +34,8 @@ def farthest(points, m):
 def plain_spacing(points):
     """Return for each cloud the distance that is the unit of the widths of columns."""
     count = min(SPACING_POINTS, points.shape[1])
-    chosen = gather_points(points, farthest(points, count))
+    rows = farthest(points, count)
+    chosen = gather_points(points, rows)
     to_last = chosen[:, :-1] - chosen[:, -1:]
     nearest = to_last.norm(dim=2).amin(1)
     return nearest * (count / SPACING_POINTS) ** 0.5
@@ -42,20 +43,25 @@ def plain_spacing(points):
 
 def plain_dense(net, points, keys):
     """S entry by entry of its definition: content of a slot, and distances to its anchor."""
-    unit = plain_spacing(points)
-    cloud = torch.arange(len(keys))
-    columns = []
-    for j, row in enumerate(farthest(points, net.m).T):
-        key_of_anchor = keys[cloud, row]
-        relation = key_of_anchor @ net.queries.relation.T
-        query = net.queries.slots[j] + relation / keys.shape[2] ** 0.5
-        content = (keys * query[:, None]).sum(2)
-        anchor = points[cloud, row]
-        width = unit * net.queries.log_width[j].exp()
-        squares = (points - anchor[:, None]).square().sum(2)
-        logits = content - squares / width[:, None] ** 2
-        columns.append((logits / net.tau).softmax(1))
-    return torch.stack(columns, 2)
+    rows = farthest(points, net.m)
+    units = plain_spacing(points)
+    clouds = []
+    for cloud, keys_of_cloud, rows_of_cloud, unit in zip(points, keys, rows, units, strict=True):
+        columns = []
+        for j, row in enumerate(rows_of_cloud):
+            columns.append(plain_column(net, cloud, keys_of_cloud, j, row, unit))
+        clouds.append(torch.stack(columns, 1))
+    return torch.stack(clouds)
+
+
+def plain_column(net, cloud, keys, j, row, unit):
+    """Return column j of S of one cloud, whose anchor is in this row."""
+    relation = net.queries.relation @ keys[row]
+    query = net.queries.slots[j] + relation / keys.shape[1] ** 0.5
+    width = unit * net.queries.log_width[j].exp()
+    squares = (cloud - cloud[row]).square().sum(1)
+    logits = keys @ query - squares / width**2
+    return (logits / net.tau).softmax(0)
 
 
 @pytest.mark.parametrize("training", [True, False])
@@ -74,9 +80,8 @@ def test_anchors_equal_dense_softmax_of_distances(training, number, randn):
     assert_close(output.matrix.dense(), dense)
     assert_close(output.points, expected)
     parameters = list(net.queries.parameters())
-    along = (output.points * direction).sum()
-    gradients = torch.autograd.grad(along, parameters, retain_graph=True)
-    expected_gradients = torch.autograd.grad((expected * direction).sum(), parameters)
+    gradients = torch.autograd.grad(output.points, parameters, direction, retain_graph=True)
+    expected_gradients = torch.autograd.grad(expected, parameters, direction)
     for gradient in expected_gradients:
         assert gradient.abs().max() > 0
     assert_close(gradients, expected_gradients)
@@ -91,12 +96,13 @@ def test_untrained_anchors_are_near_farthest_points(width, m, randn):
 
     sampled = net(points).points
 
-    anchors = gather_points(points, farthest(points, m))
+    rows = farthest(points, m)
+    anchors = gather_points(points, rows)
     apart = (sampled - anchors).norm(dim=2)
-    last_to_others = torch.cdist(anchors, anchors)[:, -1, :-1]
-    between = last_to_others.amin(1, keepdim=True)
-    assert (apart < width * between).all()
-    assert apart.max() > width * between.mean() / 20
+    to_last = anchors[:, :-1] - anchors[:, -1:]
+    spacing = to_last.norm(dim=2).amin(1, keepdim=True)
+    assert (apart < width * spacing).all()
+    assert apart.max() > width * spacing.mean() / 20
 
 
 def test_anchors_are_nested_in_size_and_weights(randn):
@@ -121,13 +127,13 @@ def test_anchors_of_large_clouds_are_computed_in_blocks(randn, monkeypatch):
     net = small(moved=True).double()
     parameters = list(net.queries.parameters())
     whole = net(points).points
-    expected = torch.autograd.grad((whole * direction).sum(), parameters)
+    expected = torch.autograd.grad(whole, parameters, direction)
     monkeypatch.setitem(attention.BLOCKS, "cpu", attention.Blocks(0, 4, 10))
 
     by_blocks = net(points).points
 
     assert_close(by_blocks, whole, atol=1e-12, rtol=0)
-    gradients = torch.autograd.grad((by_blocks * direction).sum(), parameters)
+    gradients = torch.autograd.grad(by_blocks, parameters, direction)
     assert_close(gradients, expected, atol=1e-9, rtol=1e-9)
 
 
@@ -137,9 +143,12 @@ def test_anchors_with_fused_layers_equal_layers(randn):
         net(randn(4, 50, 3))
     net.eval()
     points = randn(2, 50, 3)
+
     with torch.no_grad():
         fast = net(points).points
-    assert_close(fast, net(points).points.detach(), atol=1e-5, rtol=1e-4)
+
+    expected = net(points).points.detach()
+    assert_close(fast, expected, atol=1e-5, rtol=1e-4)
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
@@ -157,20 +166,25 @@ def test_anchors_in_half_precision_keep_distances(dtype, randn):
 
 def test_anchors_warm_start_keeps_their_start():
     plain = MOPSNet(6, feature_channels=(8, 6), rho_channels=(12, 10))
-    net = small()
-    copied = copy_tensors(plain.state_dict(), net)
-    assert "rho_local.weight" in copied
-    assert not any(name.startswith("queries") for name in copied)
     larger = small(m=9, moved=True)
-    assert "queries.slots" in copy_tensors(larger.state_dict(), net)
+    net = small()
+
+    copied_from_plain = copy_tensors(plain.state_dict(), net)
+    copied_from_larger = copy_tensors(larger.state_dict(), net)
+
+    assert "rho_local.weight" in copied_from_plain
+    for name in copied_from_plain:
+        assert not name.startswith("queries")
+    assert "queries.slots" in copied_from_larger
     assert torch.equal(net.queries.slots, larger.queries.slots[:6])
 
 
 def test_anchors_refuse_chunks(randn):
     net = small().eval()
+    points = randn(50, 3)
 
     with pytest.raises(UserError, match=r"needs all points .* chunks.*without anchors=fps"):
-        stream_sample(net, lambda: randn(50, 3).split(20))
+        stream_sample(net, lambda: points.split(20))
 
 
 def median_width(net, points):
@@ -183,7 +197,8 @@ def median_width(net, points):
 
 
 def test_untrained_columns_are_as_wide_as_the_spacing_of_their_points(rand):
-    plane = rand(1, 4000, 3) * torch.tensor([1.0, 1.0, 0.0])
+    plane = rand(1, 4000, 3)
+    plane[..., 2] = 0
     of_16 = small(m=16, anchor_width=0.5, tau_min=1.0).eval()
     of_64 = small(m=64, anchor_width=0.5, tau_min=1.0).eval()
 

@@ -29,11 +29,18 @@ def turned_pair(rng):
     angles = torch.rand(3, 3, dtype=torch.float64, generator=rng) * 3
     rotations = quaternion_to_matrix(quaternion_from_euler(angles))
     shift = torch.randn(3, 1, 3, dtype=torch.float64, generator=rng)
-    return clouds, clouds @ rotations.mT + shift, rotations, shift
+    turned = clouds @ rotations.mT + shift
+    return clouds, turned, rotations, shift
 
 
 @pytest.mark.parametrize(
-    "columns", [{}, {"candidates": 3, "neighbours": 5}, {"neighbours": 5}, {"candidates": 3}]
+    "columns",
+    [
+        {},
+        {"candidates": 3, "neighbours": 5},
+        {"neighbours": 5},
+        {"candidates": 3},
+    ],
 )
 def test_sample_of_a_turned_cloud_is_the_turned_sample(columns, rng):
     clouds, turned, rotations, shift = turned_pair(rng)
@@ -49,16 +56,22 @@ def test_sample_of_plain_anchors_does_not_turn_with_its_cloud(rng):
     clouds, turned, rotations, shift = turned_pair(rng)
     sampler = moved_sampler("fps")
 
-    apart = sampler(turned).points - (sampler(clouds).points @ rotations.mT + shift)
+    sample = sampler(clouds).points
+    sample_of_turned = sampler(turned).points
 
+    turned_sample = sample @ rotations.mT + shift
+    apart = sample_of_turned - turned_sample
     assert apart.norm(dim=2).mean() > 0.001
 
 
 def test_own_axes_of_known_farthest_points():
     # The mean is at the origin. Farthest: 4 along x; then −3 along x; then ±2 along z.
-    x = [[4.0, 0, 0], [-3, 0, 0], [-1, 0, 0], [0, 0, 2], [0, 0, -2], [0, 1, 0], [0, -1, 0]]
+    points = torch.zeros(1, 7, 3)
+    points[0, :3, 0] = torch.tensor([4.0, -3.0, -1.0])
+    points[0, 3:5, 2] = torch.tensor([2.0, -2.0])
+    points[0, 5:, 1] = torch.tensor([1.0, -1.0])
 
-    axes = own_axes(torch.tensor([x]))[0]
+    (axes,) = own_axes(points)
 
     first, second, third = axes.T
     assert first.tolist() == [1, 0, 0]
@@ -68,31 +81,46 @@ def test_own_axes_of_known_farthest_points():
 
 def test_own_axes_are_rotations(randn):
     clouds = randn(5, 40, 3, dtype=torch.float64)
+    centred = clouds - clouds.mean(1, keepdim=True)
 
-    axes = own_axes(clouds - clouds.mean(1, keepdim=True))
+    axes = own_axes(centred)
 
-    assert_close(axes.mT @ axes, torch.eye(3).double().expand(5, 3, 3))
-    assert_close(torch.linalg.det(axes), torch.ones(5).double())
+    identity = torch.eye(3, dtype=torch.float64)
+    for frame in axes:
+        assert_close(frame.T @ frame, identity)
+        assert torch.linalg.det(frame).item() == pytest.approx(1)
 
 
 @pytest.mark.parametrize("number", [1, 2, 3, 9])
 @pytest.mark.parametrize("direction", [[0.0, 0.0, 0.0], [1.0, 2.0, 0.5]])
 def test_points_on_one_line_give_finite_coordinates(number, direction):
-    points = torch.arange(number)[:, None] * torch.tensor(direction)
+    steps = torch.arange(number)
+    points = steps[:, None] * torch.tensor(direction)
 
-    described = in_own_frame(points[None], NO_CHANNELS)[0]
+    (described,) = in_own_frame(points[None], NO_CHANNELS)
 
-    distances = (points - points.mean(0)).norm(dim=1)
-    assert_close(described[:, 0].abs(), distances)
-    assert described[:, 1:].abs().max() < 1e-5
+    centred = points - points.mean(0)
+    along = described[:, 0].abs()
+    aside = described[:, 1:].abs()
+    assert_close(along, centred.norm(dim=1))
+    assert aside.max() < 1e-5
 
 
 def test_normals_turn_with_the_cloud(rng, randn):
     clouds, turned, rotations, _ = turned_pair(rng)
-    normals = torch.nn.functional.normalize(randn(clouds.shape).double(), dim=2)
-    channels = PointChannels(map(Channel, ("normal_x", "normal_y", "normal_z")))
+    directions = randn(clouds.shape).double()
+    normals = torch.nn.functional.normalize(directions, dim=2)
+    channels = PointChannels(
+        (
+            Channel("normal_x"),
+            Channel("normal_y"),
+            Channel("normal_z"),
+        )
+    )
+    points = torch.cat([clouds, normals], 2)
+    turned_points = torch.cat([turned, normals @ rotations.mT], 2)
 
-    described = in_own_frame(torch.cat([clouds, normals], 2), channels)
-    described_turned = in_own_frame(torch.cat([turned, normals @ rotations.mT], 2), channels)
+    described = in_own_frame(points, channels)
+    described_turned = in_own_frame(turned_points, channels)
 
     assert_close(described, described_turned)

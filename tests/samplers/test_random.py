@@ -2,6 +2,7 @@ from collections import Counter
 from itertools import permutations
 from statistics import mean
 
+import pytest
 import torch
 from scipy.special import chdtrc
 
@@ -10,8 +11,8 @@ from mops_lightning.samplers.random import RandomSampler
 
 def chi_square_p(counts, expected, share):
     """Return the p-value of equal counts, where each event draws this share of the cells."""
-    squares = sum((count - expected) ** 2 for count in counts)
-    statistic = squares / (expected * (1 - share))
+    squares = [(count - expected) ** 2 for count in counts]
+    statistic = sum(squares) / (expected * (1 - share))
     number = len(counts)
     freedom = number - 1
     return chdtrc(freedom, statistic * freedom / number)
@@ -27,8 +28,8 @@ def test_random_places_are_uniform(randn):
 
     for values in (sides, radii):
         ranks = values.argsort(1).argsort(1)
-        chosen_ranks = ranks.gather(1, indices).flatten()
-        counts = chosen_ranks.bincount(minlength=50).tolist()
+        chosen_ranks = ranks.gather(1, indices)
+        counts = chosen_ranks.flatten().bincount(minlength=50).tolist()
         assert chi_square_p(counts, 4000 * 10 / 50, 10 / 50) > 1e-3
 
 
@@ -48,8 +49,12 @@ def test_random_pairs_are_uniform(rng):
 def test_random_shared_point_is_chosen_independently(randn):
     points = randn(4000, 20, 3)
     points[:, 0] = 0.0
-    share = (RandomSampler(5)(points).indices == 0).any(1).float().mean()
-    assert abs(share - 5 / 20) < 0.03
+
+    rows = RandomSampler(5)(points).indices
+
+    is_chosen = (rows == 0).any(1)
+    share = is_chosen.float().mean()
+    assert share.item() == pytest.approx(5 / 20, abs=0.03)
 
 
 def test_random_copies_are_chosen_independently(randn):
@@ -62,7 +67,7 @@ def test_random_copies_are_chosen_independently(randn):
     different = [len(row.unique()) for row in rows]
     neither_copy = (300 * 299) / (400 * 399)
     expected = 200 * (1 - neither_copy)
-    assert abs(mean(different) - expected) < 2.5
+    assert mean(different) == pytest.approx(expected, abs=2.5)
 
 
 def test_random_by_weight_equals_successive_draws():
@@ -80,7 +85,9 @@ def test_random_by_weight_equals_successive_draws():
     statistic = 0.0
     for first, second in permutations(range(4), 2):
         left = total - weights[first]
-        share = weights[first] / total * weights[second] / left
-        expected = 3000 * share
-        statistic += (pairs[first, second] - expected) ** 2 / expected
+        share_of_first = weights[first] / total
+        share_of_second = weights[second] / left
+        expected = 3000 * share_of_first * share_of_second
+        excess = pairs[first, second] - expected
+        statistic += excess**2 / expected
     assert chdtrc(11, statistic) > 1e-3

@@ -13,7 +13,7 @@ from tests.support.losses import simplification_loss
 def plain_projected(query, cloud, k, sigma):
     """Project one point on its k nearest, differentiably."""
     squares = (query - cloud).square().sum(1)
-    near = squares.detach().argsort()[:k]
+    near = squares.argsort()[:k]
     weights = torch.exp(-squares[near] / sigma)
     weighted = weights[:, None] * cloud[near]
     return weighted.sum(0) / weights.sum()
@@ -42,8 +42,8 @@ def test_soft_projection_equals_double_loop(k, randn):
     if k == 1:
         return  # the weight is 1 for any query and sigma
     inputs = [queries, points, sigma]
-    gradients = torch.autograd.grad((fast * direction).sum(), inputs)
-    expected = torch.autograd.grad((plain * direction).sum(), inputs)
+    gradients = torch.autograd.grad(fast, inputs, direction)
+    expected = torch.autograd.grad(plain, inputs, direction)
     assert_close(gradients, expected)
 
 
@@ -72,14 +72,15 @@ def test_samplenet_projects_in_training_only(randn):
     in_training = net(points)
     in_test = net.eval()(points)
 
-    assert at_start.losses["projection"] == 0.5  # sigma starts at 1²
     generated = in_training.points
-    projected = soft_projection(generated, points, 4, 0.6**2)
+    sigma = 0.6**2
+    projected = soft_projection(generated, points, 4, sigma)
+    losses = in_training.losses
+    simplification = 3 * simplification_loss(points, generated)
+    assert at_start.losses["projection"] == 0.5  # sigma starts at 1²
+    assert losses["projection"].item() == pytest.approx(0.5 * sigma)
+    assert_close(losses["simplification"], simplification)
     assert_close(in_training.soft_projected, projected)
-    projection_loss = torch.tensor(0.5 * 0.6**2)
-    assert_close(in_training.losses["projection"], projection_loss)
-    expected = 3 * simplification_loss(points, generated)
-    assert_close(in_training.losses["simplification"], expected)
     assert in_test.soft_projected is None
 
 
@@ -96,15 +97,27 @@ def test_samplenet_projection_in_evaluation_equals_double_loop_with_learned_temp
 
 
 def test_samplenet_gamma_replaces_alpha():
-    assert SampleNet(6, alpha=30.0).alpha == 30
-    assert SampleNet(6, alpha=30.0, gamma=5e-5).alpha == 5e-5
-    assert SampleNet(6, gamma=0.0).alpha == 0
+    without = SampleNet(6, alpha=30.0)
+    with_gamma = SampleNet(6, alpha=30.0, gamma=5e-5)
+    of_zero = SampleNet(6, gamma=0.0)
+
+    assert without.alpha == 30
+    assert with_gamma.alpha == 5e-5
+    assert of_zero.alpha == 0
+
+
+def test_samplenet_keeps_its_beta():
     assert SampleNet(6, beta=1e-4).beta == 1e-4
 
 
 @pytest.mark.parametrize(
     ("sigma_min", "t", "sigma"),
-    [(0.0, 0.001, 1e-6), (1e-2, 0.05, 1e-2), (1e-2, 0.5, 0.25), (1e-4, 0.001, 1e-4)],
+    [
+        (0.0, 0.001, 1e-6),
+        (1e-2, 0.05, 1e-2),
+        (1e-2, 0.5, 0.25),
+        (1e-4, 0.001, 1e-4),
+    ],
 )
 def test_samplenet_sigma_has_lower_bound(sigma_min, t, sigma):
     net = SampleNet(6, sigma_min=sigma_min)
@@ -113,10 +126,13 @@ def test_samplenet_sigma_has_lower_bound(sigma_min, t, sigma):
 
 
 def test_progressive_training_sizes_are_powers_of_two():
-    sizes = (2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
-    assert ProgressiveSampleNet().training_sizes() == sizes
-    assert ProgressiveSampleNet(100, min_size=16).training_sizes() == (16, 32, 64, 100)
-    assert ProgressiveSampleNet(1).training_sizes() == (1,)
+    by_default = ProgressiveSampleNet()
+    from_16_to_100 = ProgressiveSampleNet(100, min_size=16)
+    of_one_point = ProgressiveSampleNet(1)
+
+    assert by_default.training_sizes() == (2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
+    assert from_16_to_100.training_sizes() == (16, 32, 64, 100)
+    assert of_one_point.training_sizes() == (1,)
 
 
 def test_progressive_samples_are_nested(randn):
@@ -144,6 +160,8 @@ def test_progressive_samplenet_adds_projection_once(reduction, randn):
     outputs = net.sample_sizes(points, sizes)
 
     assert len(sizes) == 4
-    losses = torch.stack([outputs[m].losses["projection"] for m in sizes])
-    total = losses.sum() if reduction == "sum" else losses.mean()
-    assert_close(total, torch.tensor(0.5))  # sigma starts at 1
+    losses = [outputs[m].losses["projection"].item() for m in sizes]
+    total = sum(losses)
+    if reduction == "mean":
+        total /= 4
+    assert total == pytest.approx(0.5)  # sigma starts at 1

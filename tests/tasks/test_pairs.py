@@ -31,7 +31,9 @@ def moved(batch, points):
 
 def test_pairs_target_is_moved_source(rng):
     points = clouds(rng)
+
     batch = pairs()(points, generators(6))
+
     source, target = restored(batch)
     assert_close(source, points)
     assert_close(target, moved(batch, source), atol=1e-5, rtol=0)
@@ -42,13 +44,18 @@ def test_pairs_target_is_moved_source(rng):
 def test_pairs_depend_on_own_generator_only(rng):
     points = clouds(rng)
     make = pairs(resample=20)
+
     together = make(points, generators(6))
+
+    sources, targets = together.points.chunk(2)
     for i in range(6):
-        alone = make(points[i : i + 1], generators(6)[i : i + 1])
-        for name in ("quaternion", "translation"):
-            assert torch.equal(getattr(alone, name)[0], getattr(together, name)[i])
-        assert_close(alone.points[0], together.points[i])
-        assert_close(alone.points[1], together.points[6 + i])
+        own_generator = generators(6)[i]
+        alone = make(points[i : i + 1], [own_generator])
+        source, target = alone.points
+        assert torch.equal(alone.quaternion[0], together.quaternion[i])
+        assert torch.equal(alone.translation[0], together.translation[i])
+        assert_close(source, sources[i])
+        assert_close(target, targets[i])
 
 
 def rows_of(cloud, points):
@@ -59,14 +66,19 @@ def rows_of(cloud, points):
 
 def test_pairs_resample_draws_different_points(rng):
     points = clouds(rng, points=60)
+
     batch = pairs(resample=20)(points, generators(6))
+
     source, target = restored(batch)
-    assert source.shape == target.shape == (6, 20, 3)
+    moved_points = moved(batch, points)
+    assert source.shape == (6, 20, 3)
+    assert target.shape == (6, 20, 3)
     for i in range(6):
-        mine = rows_of(source[i], points[i])
-        theirs = rows_of(target[i], moved(batch, points)[i])
-        assert len(mine) == len(theirs) == 20
-        assert mine != theirs
+        rows_of_source = rows_of(source[i], points[i])
+        rows_of_target = rows_of(target[i], moved_points[i])
+        assert len(rows_of_source) == 20
+        assert len(rows_of_target) == 20
+        assert rows_of_source != rows_of_target
 
 
 def test_pairs_resample_out_of_range_raises(rng):

@@ -1,3 +1,4 @@
+import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 from torch.testing import assert_close
@@ -19,18 +20,19 @@ class Kabsch(torch.nn.Module):
     """The exact answer where point i of the source is point i of the target."""
 
     def forward(self, source, target):
-        source_mean = source.mean(1, keepdim=True)
-        target_mean = target.mean(1, keepdim=True)
-        covariance = (source - source_mean).mT @ (target - target_mean)
-        u, _, vh = torch.linalg.svd(covariance)
-        handedness = torch.linalg.det(vh.mT @ u.mT).sign()
-        flip = torch.eye(3).repeat(len(u), 1, 1)
-        flip[:, 2, 2] = handedness
-        rotation = vh.mT @ flip @ u.mT
-        shift = target_mean - source_mean @ rotation.mT
-        scalar_last = Rotation.from_matrix(rotation.numpy()).as_quat()
-        quaternion = torch.from_numpy(scalar_last).roll(1, 1)
-        return Motion(quaternion.float(), shift[:, 0])
+        quaternions = []
+        shifts = []
+        for source_cloud, target_cloud in zip(source.numpy(), target.numpy(), strict=True):
+            source_mean = source_cloud.mean(0)
+            target_mean = target_cloud.mean(0)
+            centred_source = source_cloud - source_mean
+            centred_target = target_cloud - target_mean
+            rotation, _ = Rotation.align_vectors(centred_target, centred_source)
+            quaternions.append(rotation.as_quat(scalar_first=True))
+            shifts.append(target_mean - rotation.apply(source_mean))
+        quaternion = torch.tensor(np.array(quaternions)).float()
+        shift = torch.tensor(np.array(shifts)).float()
+        return Motion(quaternion, shift)
 
 
 def small_net():
@@ -60,8 +62,11 @@ def test_disagreement_of_shifted_motions_is_squared_shift():
     true = motion(1)
     shift = torch.tensor([1.0, -2.0, 0.5])
     moved = true._replace(translation=true.translation + shift)
+
     apart = task().disagreement(moved, true)
-    assert_close(apart, torch.full_like(apart, 5.25))
+
+    expected = 1 + 2**2 + 0.5**2
+    assert_close(apart, torch.full_like(apart, expected))
 
 
 class RecordingSampler(FPSSampler):
@@ -77,8 +82,11 @@ class RecordingSampler(FPSSampler):
 def test_test_samples_sources_and_targets_in_one_call():
     sampler = RecordingSampler(8)
     module = Experiment(task(resample=40), sampler, sizes=(4, 8))
-    loader = CloudLoader(small_dataset(test=4).test, 4, make_batch=module.task.make_batch)
+    clouds = small_dataset(test=4).test
+    loader = CloudLoader(clouds, 4, make_batch=module.task.make_batch)
+
     quiet_trainer(1).test(module, loader, verbose=False)
+
     assert sampler.shapes == [(8, 40, 3)]
 
 
@@ -96,16 +104,17 @@ def test_figures_show_every_readout_and_its_error(rng):
     figures = figures_of(module, batch, samples, ["long", "tall"])
 
     axes = figures["pairs"].axes
-    # Samples have rings, full clouds have none.
-    assert [len(cell.collections) for cell in axes] == [2, 4, 2, 2, 4, 2]
-    titles = [cell.get_title() for cell in axes[:3]]
-    assert titles == ["before (centred)", "by sampled", "by full"]
     result = module.step(batch, batch.points)
-    _, error = RotationError.of(result.predictions, result.targets)
-    assert text_of(axes[5]) == f"rotation error {error:.1f}°"
     still = identity_motion(batch.points[:2])
+    _, error = RotationError.of(result.predictions, result.targets)
     _, angle = RotationError.of(result.targets, still)
+    # Samples have rings, full clouds have none.
+    numbers_of_sets = [len(cell.collections) for cell in axes]
+    titles = [cell.get_title() for cell in axes[:3]]
+    assert numbers_of_sets == [2, 4, 2, 2, 4, 2]
+    assert titles == ["before (centred)", "by sampled", "by full"]
     assert text_of(axes[3]) == f"tall, {angle:.1f}° apart"
+    assert text_of(axes[5]) == f"rotation error {error:.1f}°"
 
 
 def test_clouds_of_a_pair_have_titles_of_their_own():

@@ -17,7 +17,8 @@ from tests.ops.test_stability import box
 
 @pytest.fixture
 def clouds():
-    return torch.from_numpy(np.stack([box(400, seed) for seed in range(3)])).float() / 4
+    boxes = [box(400, seed) for seed in range(3)]
+    return torch.from_numpy(np.stack(boxes)).float() / 4
 
 
 def task(**settings):
@@ -25,7 +26,8 @@ def task(**settings):
 
 
 def batch_of(clouds, **settings):
-    return task(**settings).make_batch(clouds, [generator(7, row) for row in range(len(clouds))])
+    generators = [generator(7, row) for row in range(len(clouds))]
+    return task(**settings).make_batch(clouds, generators)
 
 
 def test_halves_share_no_point_and_target_is_moved(clouds):
@@ -45,28 +47,34 @@ def test_halves_share_no_point_and_target_is_moved(clouds):
 
 
 def test_starts_are_within_their_limits(clouds):
-    batch = batch_of(clouds.repeat(50, 1, 1), angle=15, shift=0.1)
+    many = clouds.repeat(50, 1, 1)
 
-    still = identity_motion(clouds.repeat(50, 1, 1))
-    angles = RotationError.of(Motion(batch.quaternion, batch.translation), still)
+    batch = batch_of(many, angle=15, shift=0.1)
+
+    start = Motion(batch.quaternion, batch.translation)
+    still = identity_motion(many)
+    angles = RotationError.of(start, still)
     shifts = torch.linalg.vector_norm(batch.translation, dim=1)
     assert 14 < angles.max() <= 15
     assert 0.09 < shifts.max() <= 0.1
 
 
 def test_step_with_all_points_finds_the_motion():
-    batch = batch_of(torch.from_numpy(box(3000)[None]).float() / 4)
+    cloud = torch.from_numpy(box(3000)).float() / 4
+    batch = batch_of(cloud[None])
 
     result = task().step(batch, batch.points)
 
-    assert RotationError.of(result.predictions, result.targets).max() < 1
+    error = RotationError.of(result.predictions, result.targets)
+    assert error.item() < 1
 
 
 def test_sample_of_the_target_is_not_used(clouds):
     batch = batch_of(clouds)
     source, target = batch.points.chunk(2)
+    sample = batch.points[:, :50]
 
-    found = task().predict(batch, torch.cat([source[:, :50], target[:, :50]]))
+    found = task().predict(batch, sample)
 
     expected = PlaneICP()(source[:, :50], target)
     assert torch.equal(found.quaternion, expected.quaternion)
