@@ -99,7 +99,7 @@ def test_metric_of_two_processes_with_equal_data_equals_that_of_one(metric):
     def is_distributed():
         return True
 
-    classes = ()
+    classes: tuple[int, ...] = ()
     if metric.__module__ == classification.__name__:
         classes = (3,)
     alone = metric(*classes)

@@ -169,7 +169,7 @@ WRONG_POINTS = {
     "not finite": (MANY / 0, "finite"),
     "too few": (MANY[:, :5], "number of points N=5, got m=8"),
 }
-WRONG_SETTINGS = {
+WRONG_SETTINGS: dict[str, tuple[dict[str, Any], str]] = {
     "m": ({"m": 9}, "m must be 8"),
     "m text": ({"m": "9"}, "m must be a whole number"),
     "readout": ({"readout": "matchd"}, "Did you mean 'matched'"),
