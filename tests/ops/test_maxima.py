@@ -7,9 +7,9 @@ from mops_lightning.ops.maxima import max_of_points
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
-def test_max_of_points_equals_amax_and_so_do_its_gradients(dtype, rng):
-    features = torch.randn(3, 50, 7, generator=rng).to(dtype).requires_grad_()
-    given = torch.randn(3, 7, generator=rng).to(dtype)
+def test_max_of_points_equals_amax_and_so_do_its_gradients(dtype, randn):
+    features = randn(3, 50, 7).to(dtype).requires_grad_()
+    given = randn(3, 7).to(dtype)
 
     largest = max_of_points(features)
 

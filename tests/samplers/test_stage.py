@@ -4,6 +4,7 @@ from functools import partial
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from mops_lightning import StageMOPSNet
 from mops_lightning.errors import UserError
@@ -59,10 +60,10 @@ def plain_stage(net, points, features, candidates, neighbours):
 
 
 @pytest.mark.parametrize("candidates", [None, 3])
-def test_stage_sampler_equals_a_dense_softmax_over_the_host_features(candidates, rng):
+def test_stage_sampler_equals_a_dense_softmax_over_the_host_features(candidates, randn):
     net = moved(StageMOPSNet(5, 7, key_channels=16, candidates=candidates, neighbours=6)).double()
-    points = torch.randn(1, 60, 3, dtype=torch.float64, generator=rng)
-    features = torch.randn(1, 60, 7, dtype=torch.float64, generator=rng, requires_grad=True)
+    points = randn(1, 60, 3, dtype=torch.float64)
+    features = randn(1, 60, 7, dtype=torch.float64, requires_grad=True)
     (rows,) = farthest_order(points, 60)
     if candidates is not None:
         rows = rows[: candidates * 5]
@@ -70,17 +71,17 @@ def test_stage_sampler_equals_a_dense_softmax_over_the_host_features(candidates,
     (generated,) = net.by_features(points, features, 5).points
 
     expected = plain_stage(net, points[0], features[0], rows, neighbours=6)
-    torch.testing.assert_close(generated, expected)
+    assert_close(generated, expected)
     squares = generated.square().sum()
     gradient = torch.autograd.grad(squares, features, retain_graph=True)
     expected_gradient = torch.autograd.grad(expected.square().sum(), features)
-    torch.testing.assert_close(gradient, expected_gradient)
+    assert_close(gradient, expected_gradient)
 
 
-def test_stage_sampler_loss_is_alpha_times_the_mean_squared_distance(rng):
+def test_stage_sampler_loss_is_alpha_times_the_mean_squared_distance(randn):
     net = StageMOPSNet(5, 7, alpha=3.0)
-    points = torch.randn(2, 60, 3, generator=rng)
-    features = torch.randn(2, 60, 7, generator=rng)
+    points = randn(2, 60, 3)
+    features = randn(2, 60, 7)
     output = net.by_features(points, features, 5)
     squares = torch.arange(10.0).view(2, 5)  # with a mean of 4.5
 
@@ -89,24 +90,24 @@ def test_stage_sampler_loss_is_alpha_times_the_mean_squared_distance(rng):
     assert losses == {"subset": torch.tensor(13.5)}
 
 
-def test_hierarchical_net_gives_its_stages_the_distances_to_the_nearest_points(rng):
+def test_hierarchical_net_gives_its_stages_the_distances_to_the_nearest_points(randn):
     sampler = partial(StageMOPSNet, alpha=2.0, neighbours=4)
     net = HierarchicalNet(3, sampler, points=(12,), channels=(8, 10), k=4, hidden=8)
-    points = torch.randn(4, 40, 3, generator=rng)
+    points = randn(4, 40, 3)
 
     _, (centres, _) = net.levels(points)
 
     nearest = torch.cdist(centres, points).amin(2)
     expected = 2.0 * nearest.square().mean()
-    torch.testing.assert_close(net.losses["stage1_subset"], expected)
+    assert_close(net.losses["stage1_subset"], expected)
 
 
 @pytest.mark.parametrize("k", [3, 6])
-def test_stage_gathers_the_points_nearest_to_the_anchors(k, rng):
+def test_stage_gathers_the_points_nearest_to_the_anchors(k, randn):
     net = moved(StageMOPSNet(5, 7, tau_min=1.0, anchor_width=3.0, neighbours=6)).eval()
     stage = Stage(net, 5, channels_in=7, channels_out=9, k=k).eval()
-    points = torch.randn(2, 60, 3, generator=rng)
-    features = torch.randn(2, 60, 7, generator=rng)
+    points = randn(2, 60, 3)
+    features = randn(2, 60, 7)
 
     centres, _ = stage(points, features)
     rows = stage._neighbours(net.by_features(points, features, 5), points)
@@ -125,11 +126,11 @@ def test_stage_gathers_the_points_nearest_to_the_anchors(k, rng):
         {"neighbours": None},
     ],
 )
-def test_stage_searches_neighbours_that_its_sampler_does_not_know(settings, rng):
+def test_stage_searches_neighbours_that_its_sampler_does_not_know(settings, randn):
     net = moved(StageMOPSNet(5, 7, tau_min=1.0, anchor_width=3.0, **settings)).eval()
     stage = Stage(net, 5, channels_in=7, channels_out=9, k=4).eval()
-    points = torch.randn(2, 60, 3, generator=rng)
-    features = torch.randn(2, 60, 7, generator=rng)
+    points = randn(2, 60, 3)
+    features = randn(2, 60, 7)
     output = net.by_features(points, features, 5)
 
     rows = stage._neighbours(output, points)
@@ -138,10 +139,10 @@ def test_stage_searches_neighbours_that_its_sampler_does_not_know(settings, rng)
     assert rows.equal(expected)
 
 
-def test_hierarchical_net_trains_its_stages_through_the_host_features(rng):
+def test_hierarchical_net_trains_its_stages_through_the_host_features(randn):
     sampler = partial(StageMOPSNet, alpha=1.0, neighbours=4, overlap=0.1)
     net = HierarchicalNet(3, sampler, points=(12, 6), channels=(8, 10, 12), k=4, hidden=8)
-    points = torch.randn(4, 40, 3, generator=rng)
+    points = randn(4, 40, 3)
 
     logits = net(points)
     loss = logits.square().mean() + sum(net.losses.values())
@@ -161,21 +162,21 @@ def test_hierarchical_net_trains_its_stages_through_the_host_features(rng):
     assert not any(name.endswith("sampler.features") for name in modules)
 
 
-def test_stage_sampler_takes_clouds_with_fewer_points(rng):
+def test_stage_sampler_takes_clouds_with_fewer_points(randn):
     sampler = partial(StageMOPSNet, neighbours=4)
     net = HierarchicalNet(3, sampler, points=(12, 6), channels=(8, 10, 12), k=4, hidden=8).eval()
-    points = torch.randn(2, 5, 3, generator=rng)
+    points = randn(2, 5, 3)
 
     logits = net(points)
 
     assert logits.shape == (2, 3)
 
 
-def test_stage_sampler_starts_near_farthest_points(rng):
+def test_stage_sampler_starts_near_farthest_points(randn):
     net = StageMOPSNet(50, 4).eval()
-    directions = torch.randn(2, 1000, 3, generator=rng)
+    directions = randn(2, 1000, 3)
     points = torch.nn.functional.normalize(directions, dim=2)
-    features = torch.randn(2, 1000, 4, generator=rng)
+    features = randn(2, 1000, 4)
 
     generated = net.by_features(points, features, 50).points
 
@@ -184,9 +185,9 @@ def test_stage_sampler_starts_near_farthest_points(rng):
     assert apart.max() < 0.2
 
 
-def test_stage_sampler_outside_a_net_is_refused(rng):
+def test_stage_sampler_outside_a_net_is_refused(randn):
     net = StageMOPSNet(5, 7).eval()
-    points = torch.randn(1, 60, 3, generator=rng)
+    points = randn(1, 60, 3)
 
     with pytest.raises(UserError, match=r"inside a hierarchical net only.*sampler=mops"):
         net(points)
