@@ -56,7 +56,7 @@ def plain_column(net, cloud, candidates, keys, j, anchor, unit):
     query = net.queries.slots[j] + relation / keys.shape[1] ** 0.5
     squares = (cloud[candidates] - anchor).square().sum(1)
     width = unit * net.queries.log_width[j].exp()
-    logits = keys[: len(candidates)] @ query - squares / width**2
+    logits = keys @ query - squares / width**2
     if net.queries.neighbours is not None:
         near = squares.argsort(stable=True)[: net.queries.neighbours]
         outside = torch.ones(len(candidates), dtype=torch.bool)
@@ -65,17 +65,6 @@ def plain_column(net, cloud, candidates, keys, j, anchor, unit):
     weights = (logits / net.tau).softmax(0)
     column = torch.zeros(len(cloud), dtype=cloud.dtype)
     return column.index_put((candidates,), weights)
-
-
-def plain_number(net, j, wanted):
-    """Return how many of the wanted candidates column j chooses among."""
-    c, k = net.queries.candidates, net.queries.neighbours
-    if not isinstance(net, FMOPSNet) or c is None or k is None:
-        return wanted
-    columns = 8
-    while columns <= j:
-        columns *= 2
-    return min(max(c * columns, k), wanted)
 
 
 def plain_dense(net, points, m):
@@ -93,38 +82,9 @@ def plain_dense(net, points, m):
         columns = []
         for j in range(m):
             anchor = cloud[order[j]]
-            seen = plain_number(net, j, wanted)
-            column = plain_column(net, cloud, candidates[:seen], keys, j, anchor, unit)
-            columns.append(column)
+            columns.append(plain_column(net, cloud, candidates, keys, j, anchor, unit))
         matrices.append(torch.stack(columns, 1))
     return torch.stack(matrices)
-
-
-@pytest.mark.parametrize(
-    ("candidates", "neighbours"),
-    [
-        (2, 5),
-        (4, 5),  # all 90 points are candidates of the last columns
-        (1, 30),  # more than the candidates of the first columns
-        (1, 80),
-        (2, None),
-        (None, 5),
-    ],
-)
-def test_first_local_columns_of_fmops_choose_among_the_first_candidates(
-    candidates, neighbours, rng
-):
-    net = local(FMOPSNet, m=20, candidates=candidates, neighbours=neighbours, tau_min=0.3)
-    net(drawn_normal(rng, 4, 90, 3))  # running statistics
-    net.eval()
-    points = drawn_normal(rng, 2, 90, 3)
-
-    matrix = net(points).matrix
-    smaller = net(points, 11).matrix
-
-    dense = plain_dense(net, points, 20)
-    torch.testing.assert_close(matrix.dense(), dense)
-    torch.testing.assert_close(smaller.dense(), dense[..., :11])
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ from typing import Any, Literal
 import torch
 
 from mops_lightning.errors import UserError, check_at_least, did_you_mean
-from mops_lightning.samplers.local import NestedLocalAnchors
 from mops_lightning.samplers.mops import MOPSNet
 
 DISTRIBUTIONS = ("nested", "uniform")
@@ -28,8 +27,7 @@ class FMOPSNet(MOPSNet):
         num_sizes: number of sizes with ``nested``.
         min_size: smallest training size, or m_max if that is smaller. Smaller samples can be taken,
             but are not trained for.
-        **settings: arguments of ``MOPSNet``. Where columns are local, the first ones choose among
-            fewer candidates, which are farther apart; see ``NestedLocalAnchors``.
+        **settings: arguments of ``MOPSNet``.
 
     Raises:
         UserError: an argument is out of range.
@@ -45,7 +43,6 @@ class FMOPSNet(MOPSNet):
 
     flexible = True
     nested = True
-    local_anchors = NestedLocalAnchors
 
     def __init__(
         self,

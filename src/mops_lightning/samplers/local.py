@@ -30,22 +30,18 @@ from mops_lightning.samplers.anchors import (
     squared_spacing,
 )
 
-FIRST_LEVEL = 8
-"""Number of columns of the first level of ``NestedLocalAnchors``."""
-
 
 class Thinned(NamedTuple):
     """The candidates of clouds.
 
     Attributes:
         rows: ``(B, K)`` int64, the candidates' rows in the cloud; None: all points, in their order.
-        order: ``(B, F)`` int64, the places of farthest points among the candidates, as chosen. The
-            first m are the anchors.
+        anchors: ``(B, m)`` int64, the places of the anchors among the candidates.
         unit: ``(B,)``, the squared unit of widths.
     """
 
     rows: Tensor | None
-    order: Tensor
+    anchors: Tensor
     unit: Tensor
 
     def of(self, values: Tensor) -> Tensor:
@@ -104,9 +100,8 @@ class LocalAnchors(FPSAnchors):
         thinned = self.thin(places, m)
         candidates = thinned.of(places)
         keys = keys_of(thinned).to(places.dtype)
-        anchor_places = thinned.order[:, :m]
-        anchors = gather_points(candidates, anchor_places)
-        content = self._content(gather_points(keys, anchor_places), m)
+        anchors = gather_points(candidates, thinned.anchors)
+        content = self._content(gather_points(keys, thinned.anchors), m)
         sharpness = self._sharpness(thinned.unit, m)
         if self.neighbours is None:
             apart = candidates[:, None] - anchors[:, :, None]
@@ -117,8 +112,8 @@ class LocalAnchors(FPSAnchors):
             near = all_places.expand_as(weights)
         else:
             k = min(self.neighbours, candidates.shape[1])
-            near = self._near(anchors, candidates, thinned.order, k)
-            entries = Entries(candidates, anchor_places, near)
+            near = nearest_rows(anchors, candidates, k)
+            entries = Entries(candidates, thinned.anchors, near)
             weights = column_weights(content, keys, entries, sharpness, tau)
         rows = near
         if thinned.rows is not None:
@@ -129,29 +124,14 @@ class LocalAnchors(FPSAnchors):
         """Choose the candidates of clouds ``(B, N, 3)``, and m anchors among them."""
         clouds, n, _ = places.shape
         wanted = self._wanted(n)
-        number = self._ordered(n, m) if wanted is None else wanted
-        farthest = rows_from_mean(places, number)
+        farthest = rows_from_mean(places, m if wanted is None else wanted)
         first_places = gather_points(places, farthest[:, :SPACING_POINTS])
         unit = squared_spacing(first_places)
-        if wanted is None:
-            return Thinned(None, farthest, unit)
-        in_order = torch.arange(wanted, device=places.device)
-        return Thinned(farthest[:, :wanted], in_order.expand(clouds, wanted), unit)
-
-    def _ordered(self, n: int, m: int) -> int:
-        """Return how many farthest points of n are needed where all points are candidates."""
-        return m
-
-    def _near(self, anchors: Tensor, candidates: Tensor, order: Tensor, k: int) -> Tensor:
-        """Return the places ``(B, m, k)`` of the candidates of every column.
-
-        Args:
-            anchors: ``(B, m, 3)``.
-            candidates: ``(B, K, 3)``.
-            order: see ``Thinned``.
-            k: number of entries.
-        """
-        return nearest_rows(anchors, candidates, k)
+        if wanted is not None:
+            first_rows = torch.arange(m, device=places.device)
+            anchors = first_rows.expand(clouds, m)
+            return Thinned(farthest[:, :wanted], anchors, unit)
+        return Thinned(None, farthest[:, :m], unit)
 
     def _wanted(self, n: int) -> int | None:
         """Return how many of n points are candidates; None: all, in the order of the cloud."""
@@ -175,50 +155,3 @@ class LocalAnchors(FPSAnchors):
         log_width = self.log_width[:m].to(unit.dtype)
         width = unit[:, None] * log_width.mul(2).exp()
         return width.clamp_min(SMALLEST**2).reciprocal()
-
-
-class NestedLocalAnchors(LocalAnchors):
-    """Local columns of a net whose first m columns are the sample of size m, for every m.
-
-    The k nearest of c·m_max candidates are too near to each other for a sample of few points.
-    Column j therefore chooses among the first c·L candidates, where L is the smallest of
-    ``FIRST_LEVEL``, twice, four times ... as many columns that include it: these are the candidates
-    that a net for L points would have. They do not depend on m, so that smaller samples are
-    prefixes of larger ones.
-    """
-
-    def _ordered(self, n: int, m: int) -> int:
-        if self.candidates is None or self.neighbours is None:
-            return m
-        numbers = [max(self.candidates * stop, self.neighbours) for _, stop in levels(m)]
-        return max([m, *(number for number in numbers if number < n)])
-
-    def _near(self, anchors: Tensor, candidates: Tensor, order: Tensor, k: int) -> Tensor:
-        if self.candidates is None:
-            return super()._near(anchors, candidates, order, k)
-        near = []
-        for start, stop in levels(anchors.shape[1]):
-            number = max(self.candidates * stop, k)
-            columns = anchors[:, start:stop]
-            if number >= candidates.shape[1]:
-                near.append(nearest_rows(columns, candidates, k))
-                continue
-            first = order[:, :number]
-            rows = nearest_rows(columns, gather_points(candidates, first), k)
-            places = first.gather(1, rows.flatten(1))
-            near.append(places.view_as(rows))
-        return torch.cat(near, 1)
-
-
-def levels(m: int) -> list[tuple[int, int]]:
-    """Return where the levels of m columns start and stop; the last stop may exceed m.
-
-    Examples:
-        >>> levels(20)
-        [(0, 8), (8, 16), (16, 32)]
-    """
-    found = [(0, FIRST_LEVEL)]
-    while found[-1][1] < m:
-        stop = found[-1][1]
-        found.append((stop, 2 * stop))
-    return found

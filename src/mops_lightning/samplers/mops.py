@@ -73,8 +73,6 @@ class MOPSNet(Sampler):
     """
 
     generates = True
-    local_anchors: type[LocalAnchors] = LocalAnchors
-    """How columns choose candidates, where they are local."""
 
     def __init__(
         self,
@@ -130,7 +128,7 @@ class MOPSNet(Sampler):
         elif candidates is None and neighbours is None:
             self.queries = FPSAnchors(m, width, anchor_width)
         else:
-            self.queries = self.local_anchors(m, width, anchor_width, candidates, neighbours)
+            self.queries = LocalAnchors(m, width, anchor_width, candidates, neighbours)
 
     @property
     def tau(self) -> float:
