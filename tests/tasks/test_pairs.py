@@ -1,5 +1,7 @@
+import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from torch.testing import assert_close
 
 from mops_lightning.errors import UserError
@@ -79,6 +81,30 @@ def test_pairs_resample_draws_different_points(rng):
         assert len(rows_of_source) == 20
         assert len(rows_of_target) == 20
         assert rows_of_source != rows_of_target
+
+
+def test_pairs_resample_of_all_points_has_every_point_in_another_order(rng):
+    points = clouds(rng)
+
+    batch = pairs(resample=50)(points, generators(6))
+
+    source, _ = restored(batch)
+    assert rows_of(source[3], points[3]) == set(range(50))
+    assert not torch.allclose(source[3], points[3])
+
+
+def test_pairs_turn_by_up_to_45_degrees_and_shift_by_up_to_one(randn):
+    points = randn(1, 4, 3).expand(1000, -1, -1)
+
+    batch = pairs()(points, generators(1000))
+
+    rotation = Rotation.from_quat(batch.quaternion.numpy(), scalar_first=True)
+    angles = np.abs(rotation.as_euler("xyz", degrees=True)).max(0)
+    shifts = batch.translation.abs().amax(0)
+    assert (angles < 45.001).all()
+    assert (angles > 44).all()
+    assert (shifts <= 1).all()
+    assert (shifts > 0.98).all()
 
 
 def test_pairs_resample_out_of_range_raises(rng):

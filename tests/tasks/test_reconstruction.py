@@ -39,6 +39,26 @@ def test_step_loss_is_chamfer_plus_emd(rng):
     assert_close(losses["emd"], emd)
 
 
+def test_step_assigns_points_by_blocks_of_32_in_one_round(rng):
+    module = Reconstruction(AutoEncoder(100, 8, (8, 8))).eval()
+    given = batch(rng, points=100)
+
+    losses = module.step(given, given.points).losses
+
+    built = module.net(given.points)
+    expected = earth_movers_distance(built, given.points, block=32, rounds=1)
+    assert_close(losses["emd"], expected.mean())
+
+
+def test_disagreement_of_reconstructions_is_their_chamfer_distance(randn):
+    found = randn(3, 20, 3)
+    reference = randn(3, 20, 3)
+
+    apart = task().disagreement(found, reference)
+
+    assert_close(apart, chamfer_distance(found, reference))
+
+
 def test_training_metrics_need_no_reference():
     assert set(task().metrics(training=True)) == {"chamfer", "emd"}
     assert {"chamfer", "emd", "nre_emd"} < set(task().metrics())

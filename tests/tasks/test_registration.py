@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from torch.testing import assert_close
@@ -12,6 +13,7 @@ from mops_lightning.tasks.base import figures_of
 from mops_lightning.tasks.registration import Registration, pair_batch
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.run.pictures import cloud_titles
+from tests.support.figures import drawn_places
 from tests.support.rigid import motion
 from tests.support.training import quiet_trainer, small_dataset
 
@@ -69,6 +71,17 @@ def test_disagreement_of_shifted_motions_is_squared_shift():
     assert_close(apart, torch.full_like(apart, expected))
 
 
+def test_disagreement_of_turned_motions_is_that_of_the_turned_axes():
+    still = Motion(torch.tensor([[1.0, 0, 0, 0]]), torch.zeros(1, 3))
+    half = 0.5**0.5
+    quarter_turn = Motion(torch.tensor([[half, half, 0, 0]]), torch.zeros(1, 3))
+
+    apart = task().disagreement(quarter_turn, still)
+
+    # Two unit axes end a square root of 2 away.
+    assert apart.tolist() == pytest.approx([4.0])
+
+
 class RecordingSampler(FPSSampler):
     def __init__(self, m):
         super().__init__(m)
@@ -115,6 +128,21 @@ def test_figures_show_every_readout_and_its_error(rng):
     assert titles == ["before (centred)", "by sampled", "by full"]
     assert text_of(axes[3]) == f"tall, {angle:.1f}° apart"
     assert text_of(axes[5]) == f"rotation error {error:.1f}°"
+
+
+def test_figures_draw_sources_on_their_targets_after_the_true_motion(randn):
+    module = task(Kabsch())
+    source = randn(2, 30, 3) + 3  # far from its centroid
+    true = motion(1, number=2)
+    batch = pair_batch(source, true.apply(source), true)
+    sample = batch.points[:, :6]
+
+    figures = figures_of(module, batch, {"sampled": sample}, ["long", "tall"])
+
+    for axes in (figures["pairs"].axes[1], figures["pairs"].axes[3]):
+        moved, target, moved_sample, sample_of_target = map(drawn_places, axes.collections)
+        assert moved == pytest.approx(target, abs=1e-4)
+        assert moved_sample == pytest.approx(sample_of_target, abs=1e-4)
 
 
 def test_clouds_of_a_pair_have_titles_of_their_own():

@@ -80,13 +80,18 @@ def test_sample_of_the_target_is_not_used(clouds):
     assert torch.equal(found.quaternion, expected.quaternion)
 
 
-def plain_residuals(source, target):
-    """Return the distances to the planes of the nearest points, cut off at 0.3."""
-    distances, rows = cKDTree(target).query(source)
+def plain_residuals(source, target, moved=None, most=0.3):
+    """Return the distances to the planes of the nearest points, cut off at the largest one.
+
+    ``moved``: where the source was when the nearest points were found; None: where it is.
+    """
+    if moved is None:
+        moved = source
+    distances, rows = cKDTree(target).query(moved)
     apart = (source - target[rows]).double()
     normals = surface_normals(target[None])[0][rows].double()
     residuals = (apart * normals).sum(1).abs()
-    residuals[torch.from_numpy(distances) > 0.3] = 0.3
+    residuals[torch.from_numpy(distances) > most] = most
     return residuals
 
 
@@ -101,6 +106,62 @@ def test_residuals_without_motion_equal_a_plain_form(clouds):
         expected = plain_residuals(aligned[number], target[number])
         found = residuals[number, 0].double()
         assert_close(found, expected, atol=1e-5, rtol=0)
+
+
+def turned_about_random_axes(directions, sizes, angle, shift):
+    """Return motions from six numbers for directions and two shares of the largest sizes."""
+    motions = []
+    for numbers, (share_of_angle, share_of_shift) in zip(directions, sizes, strict=True):
+        axis = numbers[:3] / numbers[:3].norm()
+        along = numbers[3:] / numbers[3:].norm()
+        turn = Rotation.from_rotvec(axis.numpy() * float(share_of_angle) * np.radians(angle))
+        motions.append((turn, along.numpy() * float(share_of_shift) * shift))
+    return motions
+
+
+def test_residuals_of_both_halves_follow_motions_that_grow_to_those_of_a_start(clouds):
+    module = task(angle=40.0, shift=0.3, max_distance=0.2)
+    batch = batch_of(clouds)
+    torch.manual_seed(5)
+
+    residuals = module.residuals(batch)
+
+    source, target = batch.points.chunk(2)
+    aligned = Motion(batch.quaternion, batch.translation).apply(source)
+    halves = torch.cat([aligned, target])
+    others = torch.cat([target, aligned])
+    assert residuals.shape == (6, 4, 200)
+    torch.manual_seed(5)
+    for number, share in enumerate([0, 1 / 3, 2 / 3, 1]):
+        sizes = share * torch.rand(6, 2)
+        motions = turned_about_random_axes(torch.randn(6, 6), sizes, angle=40.0, shift=0.3)
+        for row, (turn, shift) in enumerate(motions):
+            moved = turn.apply(halves[row].numpy()) + shift
+            expected = plain_residuals(halves[row], others[row], moved, most=0.2)
+            found = residuals[row, number].double()
+            is_same = (found - expected).abs() < 1e-5
+            assert is_same.double().mean() > 0.98  # a tie may be broken in another way
+
+
+def test_halves_of_an_odd_number_of_points_leave_one_out(clouds):
+    batch = batch_of(clouds[:, :301])
+
+    assert batch.points.shape == (6, 150, 3)
+
+
+def test_starts_turn_and_shift_by_sizes_of_their_own(clouds):
+    still = identity_motion(clouds)
+
+    turned = batch_of(clouds, angle=15, shift=0)
+    shifted = batch_of(clouds, angle=0, shift=0.1)
+    both = batch_of(clouds, angle=15, shift=0.15)
+
+    angles = RotationError.of(Motion(both.quaternion, both.translation), still)
+    shifts = both.translation.norm(dim=1)
+    assert (turned.translation == 0).all()
+    assert RotationError.of(Motion(shifted.quaternion, shifted.translation), still).max() == 0
+    # With one number for both, their quotients would be equal.
+    assert not torch.allclose(angles / 15, shifts / 0.15, atol=0.01)
 
 
 def test_loss_is_smallest_at_the_mean_residual(clouds):

@@ -1,5 +1,6 @@
 """Segmentation: parts of all points from the sampled ones; see test_contract for all tasks."""
 
+import math
 from functools import partial
 from typing import Any
 
@@ -167,6 +168,48 @@ def test_points_of_unknown_part_are_neither_learned_nor_scored(randn, rand):
     scores_of_known = task.metrics()(found.predictions[known], parts[known])
     assert scores == scores_of_known
     assert nothing.losses["cross_entropy"] == 0
+
+
+def test_loss_of_a_single_known_point_is_its_own(randn):
+    points = randn(2, 30, 3)
+    parts = torch.full((2, 30), UNKNOWN)
+    parts[1, 7] = 1
+    batch = Batch(points, torch.zeros(2).long(), parts=parts)
+    task = Segmentation(HierarchicalSegmentation(2, FPSSampler, (20, 8), (8, 16, 16), 4), 2).eval()
+
+    result = task.step(batch, points)
+
+    (logits,) = task.predict(batch, points)[1:, 7]
+    expected = F.cross_entropy(logits, torch.tensor(1))
+    assert_close(result.losses["cross_entropy"], expected)
+
+
+def test_step_passes_on_the_logits_of_all_points(halves):
+    task = Segmentation(Halves(), 2)
+    sample = halves.points[:, :25]
+
+    result = task.step(halves, sample)
+
+    assert_close(result.output, task.predict(halves, sample))
+
+
+def test_disagreement_is_the_mean_divergence_of_the_points_of_a_cloud():
+    task = Segmentation(Halves(), 2)
+    even = torch.tensor([0.5, 0.5]).log()
+    uneven = torch.tensor([0.9, 0.1]).log()
+    found = torch.stack([uneven, even, even])
+    reference = torch.stack([uneven, uneven, even])
+
+    apart = task.disagreement(found[None], reference[None])
+
+    of_second_point = 0.9 * math.log(0.9 / 0.5) + 0.1 * math.log(0.1 / 0.5)
+    assert apart.tolist() == pytest.approx([of_second_point / 3])
+
+
+@pytest.mark.parametrize("k", [0, -1])
+def test_interpolation_from_no_point_is_refused(k):
+    with pytest.raises(UserError, match=rf"k must be at least 1, got {k}\."):
+        Segmentation(Halves(), 2, k)
 
 
 def test_net_follows_order_of_points(rng, randn):

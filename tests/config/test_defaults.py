@@ -1,0 +1,70 @@
+"""One default for each argument: in its class, and in the file of its group."""
+
+from collections.abc import Iterator
+from inspect import isclass, signature
+from pathlib import Path
+from typing import Any
+
+import hydra.utils
+import pytest
+from omegaconf import DictConfig, OmegaConf
+
+CONF = Path(__file__).parents[2] / "conf"
+
+DIFFERENT = {
+    "dataset/mesh_sequence.yaml": {"n_points", "gap"},  # of one data set, in a function for several
+    "dataset/shapenet_core.yaml": {"test_share"},
+    "optimizer/muon.yaml": {"lr"},
+    "optimizer/one_cycle_fmops/registration_fast.yaml": {"lr"},
+    "sampler/samplenet_progressive.yaml": {"coverage", "coverage_per_point"},  # as published
+    "task/net/foldingnet.yaml": {"pieces"},  # MFoldingNet with one piece is FoldingNet
+}
+"""Files whose values are others than the defaults of the class, on purpose."""
+
+
+def defaults_of(target: Any) -> dict[str, Any]:
+    """Return the defaults of a function, or of a class and its bases."""
+    callables = [target]
+    if isclass(target):
+        callables = [base.__init__ for base in reversed(target.__mro__)]
+    defaults = {}
+    for function in callables:
+        for name, parameter in signature(function).parameters.items():
+            if parameter.default is not parameter.empty:
+                defaults[name] = parameter.default
+    return defaults
+
+
+def files_of_our_classes() -> Iterator[tuple[str, DictConfig]]:
+    """Yield the files of groups that name a class or function of this package."""
+    for path in sorted(CONF.rglob("*.yaml")):
+        content = OmegaConf.load(path)
+        if not isinstance(content, DictConfig) or OmegaConf.is_missing(content, "_target_"):
+            continue
+        if str(content.get("_target_")).startswith("mops_lightning."):
+            yield path.relative_to(CONF).as_posix(), content
+
+
+FILES = dict(files_of_our_classes())
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_values_of_a_group_are_the_defaults_of_its_class(file):
+    content = FILES[file]
+    defaults = defaults_of(hydra.utils.get_object(content["_target_"]))
+
+    different = set()
+    for name in content:
+        is_plain = not OmegaConf.is_interpolation(content, name)
+        if name not in defaults or not is_plain or OmegaConf.is_missing(content, name):
+            continue
+        value = content[name]
+        if isinstance(value, DictConfig):
+            continue
+        default = defaults[name]
+        if isinstance(default, tuple):
+            default = list(default)
+        if value != default:
+            different.add(name)
+
+    assert different == DIFFERENT.get(file, set())
