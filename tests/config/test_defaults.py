@@ -24,12 +24,12 @@ DIFFERENT = {
 
 def defaults_of(target: Any) -> dict[str, Any]:
     """Return the defaults of a function, or of a class and its bases."""
-    callables = [target]
+    bases = [target]
     if isclass(target):
-        callables = [base.__init__ for base in reversed(target.__mro__)]
+        bases = [*reversed(target.__mro__)]
     defaults = {}
-    for function in callables:
-        for name, parameter in signature(function).parameters.items():
+    for base in bases:
+        for name, parameter in signature(base).parameters.items():
             if parameter.default is not parameter.empty:
                 defaults[name] = parameter.default
     return defaults
@@ -54,7 +54,7 @@ def test_values_of_a_group_are_the_defaults_of_its_class(file):
     defaults = defaults_of(hydra.utils.get_object(content["_target_"]))
 
     different = set()
-    for name in content:
+    for name in map(str, content):
         is_plain = not OmegaConf.is_interpolation(content, name)
         if name not in defaults or not is_plain or OmegaConf.is_missing(content, name):
             continue

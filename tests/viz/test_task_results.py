@@ -1,5 +1,7 @@
 """What figures of pairs, reconstructions and parts draw of every cloud."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -111,7 +113,7 @@ def test_reconstructions_are_coloured_by_depth_and_framed_as_their_clouds(randn)
     figure = reconstruction_grid(points, full, {"fps": result}, ["a"])
 
     cloud, from_all, *_ = figure.axes
-    depth = from_all.collections[0].get_array()
+    depth = np.asarray(from_all.collections[0].get_array())
     np.testing.assert_allclose(depth, -full[0, :, 2])
     assert from_all.get_xlim() == cloud.get_xlim()
 
@@ -127,7 +129,8 @@ def test_part_grid_colours_every_cloud_by_its_own_parts_on_one_scale(randn):
     for axes, parts in zip(of_second, (true, found), strict=True):
         (collection,) = axes.collections
         assert_draws(collection, points[1])
-        assert collection.get_array().tolist() == parts[1].tolist()
+        drawn = np.asarray(collection.get_array())
+        assert drawn.tolist() == parts[1].tolist()
         assert collection.get_clim() == (0, 3)
     titles = [axes.get_title() for axes in figure.axes]
     labels = [axes.texts[0].get_text() for axes in figure.axes]
@@ -156,7 +159,7 @@ def test_clouds_are_drawn_with_one_scale_on_all_axes():
 
     figure = figures.cloud_grid(points, {}, [""])
 
-    (axes,) = figure.axes
+    axes: Any = figure.axes[0]
     # The middle of each axis, and half of the longest side around it.
     assert axes.get_xlim() == pytest.approx((0, 8))
     assert axes.get_ylim() == pytest.approx((-5, 3))
@@ -176,7 +179,8 @@ def test_markers_of_many_samples_shrink_to_a_least_size(number, area, rand):
 
     figure = figures.cloud_grid(points, {"matched": points[:, :number]}, [""])
 
-    _, marked = figure.axes[1].collections
+    axes: Any = figure.axes[1]
+    _, marked = axes.collections
     assert marked.get_sizes().tolist() == [area]
 
 
