@@ -5,12 +5,15 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
+from torch.testing import assert_close
 from trimesh.creation import box
 
 from mops_lightning.data import cloud_folder as module
-from mops_lightning.data.formats.registry import WRITERS
 from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import UserError
+from tests.support.cloud_files import write_cloud, write_table
+from tests.support.clouds import normal_points
 from tests.support.meshes import write_mesh
 
 cloud_folder = partial(module.cloud_folder, test_frames=None, crop="nearest", crops=32)
@@ -20,9 +23,9 @@ FORMATS = (".ply", ".pcd", ".bin", ".npy", ".npz", ".xyz", ".txt")
 
 def write(path, seed=0, number=300):
     path.parent.mkdir(parents=True, exist_ok=True)
-    unit = np.random.default_rng(seed).normal(size=(number, 3))
+    unit = normal_points(number, seed)
     points = unit * [3, 2, 1] + 50
-    WRITERS[path.suffix](path, Table(points))
+    write_cloud(path, points)
 
 
 @pytest.fixture
@@ -91,13 +94,13 @@ def test_cloud_folder_crops_do_not_depend_on_other_files(folder):
 
 
 def test_cloud_folder_columns_name_those_of_bin_files(tmp_path):
-    xyz = np.random.default_rng(0).normal(size=(300, 3)).astype(np.float32)
+    xyz = normal_points(300, 0).astype(np.float32)
     constant_first = np.insert(xyz, 0, 7.0, axis=1)
     folder = tmp_path / "points"
     folder.mkdir()
     for name in ("a", "b"):
         constant_first.tofile(folder / f"{name}_named.bin")
-        WRITERS[".ply"](folder / f"{name}.ply", Table(xyz.astype(np.float64)))
+        write_cloud(folder / f"{name}.ply", xyz.astype(np.float64))
 
     data = cloud_folder(
         tmp_path,
@@ -113,7 +116,7 @@ def test_cloud_folder_columns_name_those_of_bin_files(tmp_path):
     expected.sort(axis=0)
     for cloud in all_clouds(data).numpy():
         cloud.sort(axis=0)
-        np.testing.assert_allclose(cloud, expected, atol=1e-5)
+        assert_allclose(cloud, expected, atol=1e-5)
 
 
 def test_cloud_folder_folders_are_classes_and_splits(tmp_path):
@@ -161,9 +164,9 @@ def test_cloud_folder_surface_reads_modelnet_layout(mesh_layout, capsys):
         assert clouds.points.dtype == torch.float32
         assert clouds.labels.dtype == torch.int64
         means = clouds.points.mean(1)
-        torch.testing.assert_close(means, torch.zeros(number, 3))
+        assert_close(means, torch.zeros(number, 3))
         farthest = clouds.points.norm(dim=2).amax(1)
-        torch.testing.assert_close(farthest, torch.ones(number))
+        assert_close(farthest, torch.ones(number))
     assert capsys.readouterr() == ("", "")  # no progress bar without a terminal
 
 
@@ -257,7 +260,7 @@ def test_cloud_folder_tiles_score_every_labelled_point_of_a_file_once(tmp_path):
         points = np.random.default_rng(seed).uniform(0, [40, 30, 2], (number, 3))
         classes = np.where(points[:, 2] < 1, 2, 5)
         table = Table(points, {"classification": classes})
-        WRITERS[".ply"](tmp_path / f"{seed}.ply", table)
+        write_table(tmp_path / f"{seed}.ply", table)
 
     data = module.cloud_folder(
         tmp_path, 128, test_frames=None, crop="tiles", crops=None, label="classification"

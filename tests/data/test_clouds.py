@@ -1,5 +1,6 @@
 import pytest
 import torch
+from torch.testing import assert_close
 
 from mops_lightning.data.clouds import CloudDataset, Clouds, choose_classes, noisy, scale_warning
 from mops_lightning.errors import UserError
@@ -44,8 +45,8 @@ def test_noisy_depends_on_position_and_scales(rng):
     points = torch.randn(5, 30, 3, generator=rng)
     small, large = (noisy(split_of(points), noise).points - points for noise in (0.01, 0.1))
     first = noisy(split_of(points[:3]), 0.1).points - points[:3]
-    torch.testing.assert_close(large[:3], first)
-    torch.testing.assert_close(10 * small, large, atol=1e-5, rtol=1e-4)
+    assert_close(large[:3], first)
+    assert_close(10 * small, large, atol=1e-5, rtol=1e-4)
     assert not torch.equal(small[0], small[1])
     assert torch.equal(noisy(split_of(points), 0.0).points, points)
 

@@ -2,13 +2,17 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
+from scipy.interpolate import interpn
+from torch.testing import assert_close
 
 from mops_lightning.channels import Channel, PointChannels
 from mops_lightning.data.clouds import Clouds
 from mops_lightning.data.corruptions import KINDS, corrupt
 from mops_lightning.errors import UserError
+from mops_lightning.seeding import generator
 
 N = 400
 MOVED = ("jitter", "rotation", "scaling", "shear", "distortion")
@@ -22,18 +26,21 @@ def clouds():
     points = torch.randn(4, N, 3, generator=rng)
     centred = points - points.mean(1, keepdim=True)
     radii = centred.norm(dim=2).amax(1)
-    return Clouds(centred / radii[:, None, None], torch.arange(4))
+    normalised = centred / radii[:, None, None]
+    return Clouds(normalised, torch.arange(4))
 
 
 def rows_in(part, whole):
     """Return the row in ``whole`` of each point of ``part``; fails if there is none."""
-    equal = (part[:, None] == whole[None]).all(2)
+    same_coordinates = part[:, None] == whole[None]
+    equal = same_coordinates.all(2)
     assert equal.any(1).all()
     return equal.int().argmax(1)
 
 
 def removed(clouds, spec, s):
-    kept = rows_in(corrupt(clouds, spec).points[s], clouds.points[s])
+    left = corrupt(clouds, spec).points[s]
+    kept = rows_in(left, clouds.points[s])
     gone = torch.ones(N, dtype=torch.bool)
     gone[kept] = False
     assert gone.sum() == N - len(kept)
@@ -42,8 +49,10 @@ def removed(clouds, spec, s):
 
 def neighbourhoods(cloud, size):
     """Return for every point, as a mask, its ``size`` nearest."""
-    near = torch.cdist(cloud, cloud).argsort(1)[:, :size]
-    return torch.zeros(N, N, dtype=torch.bool).scatter_(1, near, True)
+    order = torch.cdist(cloud, cloud).argsort(1)
+    near = order[:, :size]
+    is_near = torch.zeros(N, N, dtype=torch.bool)
+    return is_near.scatter_(1, near, True)
 
 
 def test_every_kind_is_tested():
@@ -67,10 +76,12 @@ def test_draw_depends_on_the_position_of_the_cloud_only(clouds, kind):
 
 @pytest.mark.parametrize("kind", MOVED)
 def test_higher_severity_moves_points_farther(clouds, kind):
-    moved = [
-        (corrupt(clouds, f"{kind}-{severity}").points - clouds.points).norm(dim=2).mean().item()
-        for severity in (1, 3, 5)
-    ]
+    moved = []
+    for severity in (1, 3, 5):
+        shift = corrupt(clouds, f"{kind}-{severity}").points - clouds.points
+        distances = shift.norm(dim=2)
+        moved.append(distances.mean().item())
+
     assert 0 < moved[0] < moved[1] < moved[2]
 
 
@@ -80,8 +91,9 @@ def test_removal_keeps_a_subset_in_order(clouds, kind):
     for severity in range(1, 6):
         points = corrupt(clouds, f"{kind}-{severity}").points
         counts.append(points.shape[1])
-        for s in range(len(points)):
-            assert rows_in(points[s], clouds.points[s]).diff().min() > 0
+        for cloud, whole in zip(points, clouds.points, strict=True):
+            rows = rows_in(cloud, whole)
+            assert rows.diff().min() > 0
     assert counts == sorted(counts, reverse=True)
     assert N > counts[0] > counts[4]
 
@@ -95,9 +107,35 @@ def test_addition_keeps_the_cloud_first(clouds, kind):
     assert N < few.shape[1] < many.shape[1]
 
 
-def test_jitter_has_the_standard_deviation(clouds):
-    noise = corrupt(clouds, "jitter-5").points - clouds.points
-    assert noise.std().item() == pytest.approx(0.05, rel=0.05)
+SIZES = {
+    "density_down": (370, 340, 310, 280, 250),
+    "density_up": (370, 340, 310, 280, 250),
+    "cutout": (376, 364, 340, 316, 280),
+    "drop_global": (300, 250, 200, 150, 100),
+    "drop_local": (360, 320, 280, 240, 200),
+    "add_global": (404, 408, 412, 416, 420),
+    "add_local": (440, 480, 520, 560, 600),
+    "background": (409, 410, 411, 413, 420),
+}
+"""Points that are left of 400, or come out, at severities 1 to 5."""
+
+
+@pytest.mark.parametrize("kind", SIZES)
+def test_every_severity_has_its_number_of_points(clouds, kind):
+    sizes = []
+    for severity in range(1, 6):
+        corrupted = corrupt(clouds, f"{kind}-{severity}")
+        sizes.append(corrupted.points.shape[1])
+
+    assert tuple(sizes) == SIZES[kind]
+
+
+@pytest.mark.parametrize("severity", [1, 2, 3, 4, 5])
+def test_jitter_has_the_standard_deviation(clouds, severity):
+    noise = corrupt(clouds, f"jitter-{severity}").points - clouds.points
+
+    spread = noise.std().item()
+    assert spread == pytest.approx(0.01 * severity, rel=0.05)
 
 
 def linear_map(before, after):
@@ -110,10 +148,86 @@ def test_rotation_turns_by_at_most_its_angle(clouds):
 
     for before, after in zip(clouds.points, turned, strict=True):
         rotation = linear_map(before, after)
-        assert torch.allclose(rotation @ rotation.T, torch.eye(3), atol=1e-4)
+        product = rotation @ rotation.T
+        assert torch.allclose(product, torch.eye(3), atol=1e-4)
         assert torch.linalg.det(rotation) > 0
         cosine = (rotation.trace() - 1) / 2
-        assert 1 < math.degrees(math.acos(cosine)) <= 30
+        degrees = math.degrees(math.acos(cosine))
+        assert 1 < degrees <= 30
+
+
+def maps_of_many(kind, severity):
+    """Return the linear maps ``(200, 3, 3)`` of 200 clouds, up to a factor for each of them."""
+    rng = torch.Generator().manual_seed(1)
+    points = torch.randn(200, 12, 3, generator=rng)
+    many = Clouds(points, torch.zeros(200, dtype=torch.long))
+    mapped = corrupt(many, f"{kind}-{severity}").points
+    before = points - points.mean(1, keepdim=True)
+    after = mapped - mapped.mean(1, keepdim=True)
+    return linear_map(before, after)
+
+
+@pytest.mark.parametrize(
+    ("severity", "limit"),
+    [
+        (1, 15),
+        (2, 30),
+        (3, 60),
+        (4, 90),
+        (5, 180),
+    ],
+)
+def test_rotations_reach_the_angle_of_their_severity(severity, limit):
+    rotations = maps_of_many("rotation", severity)
+
+    traces = rotations.diagonal(dim1=1, dim2=2).sum(1)
+    cosines = (traces - 1) / 2
+    degrees = torch.rad2deg(cosines.clamp(-1, 1).acos())
+    assert 0.9 * limit < degrees.max() <= limit + 0.1
+
+
+@pytest.mark.parametrize(
+    ("severity", "factor"),
+    [
+        (1, 1.6),
+        (2, 1.7),
+        (3, 1.8),
+        (4, 1.9),
+        (5, 2.0),
+    ],
+)
+def test_axes_are_scaled_up_and_down_by_the_factor_of_their_severity(severity, factor):
+    factors = maps_of_many("scaling", severity).diagonal(dim1=1, dim2=2)
+
+    ratios = factors.amax(1) / factors.amin(1)
+    assert factor**1.8 < ratios.max() <= factor**2 + 1e-3
+
+
+@pytest.mark.parametrize("severity", [1, 2, 3, 4, 5])
+def test_shear_mixes_coordinates_up_to_the_amount_of_its_severity(severity):
+    matrices = maps_of_many("shear", severity)
+
+    scale = matrices[:, 0, 0]
+    mixed = matrices / scale[:, None, None] - torch.eye(3)
+    amount = 0.05 * severity
+    assert 0.98 * amount < mixed.amax() <= amount + 1e-4
+    assert -amount - 1e-4 <= mixed.amin() < -0.98 * amount
+
+
+@pytest.mark.parametrize("severity", [1, 5])
+def test_distortion_equals_scipys_interpolation_of_its_lattice(clouds, severity):
+    distorted = corrupt(clouds, f"distortion-{severity}").points
+
+    nodes = np.linspace(-1, 1, 5)
+    for number, (before, after) in enumerate(zip(clouds.points, distorted, strict=True)):
+        drawn = torch.rand(3, 5, 5, 5, generator=generator(17, number))
+        offsets_of_nodes = 0.1 * severity * (2 * drawn - 1)
+        by_z_y_x = offsets_of_nodes.permute(1, 2, 3, 0).numpy()
+        offsets = interpn((nodes, nodes, nodes), by_z_y_x, before.flip(1).numpy())
+        moved = before + torch.from_numpy(offsets)
+        centred = moved - moved.mean(0)
+        expected = centred / centred.norm(dim=1).max()
+        assert_close(after, expected.float(), atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize(
@@ -130,7 +244,8 @@ def test_scaling_and_shear_are_linear_maps(clouds, kind, largest_off_diagonal, l
         centred = before - before.mean(0)
         centred_after = after - after.mean(0)
         matrix = linear_map(centred, centred_after)
-        assert torch.allclose(centred @ matrix, centred_after, atol=1e-4)
+        mapped_linearly = centred @ matrix
+        assert torch.allclose(mapped_linearly, centred_after, atol=1e-4)
         diagonal = matrix.diagonal()
         off_diagonal = (matrix - diagonal.diag()) / diagonal.mean()
         assert off_diagonal.abs().max() <= largest_off_diagonal
@@ -142,9 +257,12 @@ def test_scaling_and_shear_are_linear_maps(clouds, kind, largest_off_diagonal, l
 def test_distortion_moves_neighbours_alike(clouds):
     cloud = clouds.points[0]
     other = corrupt(clouds, "distortion-1").points[0]
-    near = torch.cdist(cloud, cloud).fill_diagonal_(9).argmin(1)
+    distances = torch.cdist(cloud, cloud).fill_diagonal_(9)
+    nearest = distances.argmin(1)
     shift = other - cloud
-    assert (shift - shift[near]).norm(dim=1).mean() < 0.5 * shift.std(0).norm()
+    differences = (shift - shift[nearest]).norm(dim=1)
+    spread = shift.std(0).norm()
+    assert differences.mean() < 0.5 * spread
 
 
 def test_cutout_cuts_whole_neighbourhoods(clouds):
@@ -173,12 +291,51 @@ def test_density_changes_inside_or_outside_of_one_neighbourhood(clouds):
         assert up.sum() == round(0.75 * size)
 
 
+@pytest.mark.parametrize("places", [2, 5])
+def test_density_changes_outside_of_every_one_of_several_neighbourhoods(clouds, places):
+    size = N // 10
+    for number, cloud in enumerate(clouds.points):
+        rng = generator(17, number)
+        is_kept = torch.zeros(N, dtype=torch.bool)
+        for _ in range(places):
+            row = torch.randint(N, (), generator=rng)
+            is_kept |= neighbourhoods(cloud, size)[row]
+
+        gone = removed(clouds, f"density_up-{places}", number)
+
+        assert gone.sum() == 30 * places
+        assert not (gone & is_kept).any()
+
+
 def test_local_drop_is_closer_together_than_global_drop(clouds):
     def spread(kind):
-        groups = [clouds.points[s][removed(clouds, kind, s)] for s in range(4)]
-        return sum(torch.cdist(group, group).mean() for group in groups)
+        total = 0.0
+        for s, cloud in enumerate(clouds.points):
+            gone = removed(clouds, kind, s)
+            group = cloud[gone]
+            total += torch.cdist(group, group).mean().item()
+        return total
 
     assert spread("drop_local-1") < 0.9 * spread("drop_global-1")
+
+
+@pytest.mark.parametrize("kind", ["drop_local", "add_local"])
+def test_local_corruptions_have_one_to_eight_places(kind):
+    """On a line with large gaps between clumps: how many clumps lose or gain points."""
+    clumps = torch.arange(20.0).repeat_interleave(20)
+    points = torch.zeros(40, N, 3)
+    points[:, :, 0] = 100 * clumps + torch.arange(N) * 1e-3
+    many = Clouds(points, torch.zeros(40, dtype=torch.long))
+
+    corrupted = corrupt(many, f"{kind}-1").points
+
+    numbers_of_places = []
+    for cloud in corrupted:
+        clump_of_points = (cloud[:, 0] / 100).round().long()
+        counts = clump_of_points.bincount(minlength=20)
+        numbers_of_places.append(int((counts != 20).sum()))
+    assert min(numbers_of_places) <= 3
+    assert 6 <= max(numbers_of_places) <= 16
 
 
 def test_added_points_are_where_they_should_be(clouds):
@@ -190,10 +347,21 @@ def test_added_points_are_where_they_should_be(clouds):
     assert radii.max() <= 1
     volumes = radii.pow(3)
     assert volumes.mean().item() == pytest.approx(0.5, abs=0.1)
-    assert cube.abs().max() <= 1
+    assert 0.95 < cube.abs().max() <= 1
     assert cube.norm(dim=2).max() > 1
     to_cloud = torch.cdist(local, clouds.points).amin(2)
     assert to_cloud.mean() < 0.2
+
+
+def test_local_points_are_added_at_distances_of_about_a_tenth():
+    """Around one place: the standard deviation is from 0.075 to 0.125 along every axis."""
+    points = torch.zeros(20, N, 3)
+    many = Clouds(points, torch.zeros(20, dtype=torch.long))
+
+    added = corrupt(many, "add_local-5").points[:, N:]
+
+    spread = added.square().mean().sqrt().item()
+    assert spread == pytest.approx(0.1, abs=0.01)
 
 
 @pytest.mark.parametrize(
@@ -214,7 +382,9 @@ def test_unknown_kind_or_severity_is_refused(clouds, spec, said):
 def test_parts_are_kept_where_points_were_only_moved(clouds, kind):
     parts = torch.arange(4 * N).view(4, N)
 
-    corrupted = corrupt(clouds._replace(parts=parts), f"{kind}-3")
+    with_parts = clouds._replace(parts=parts)
+
+    corrupted = corrupt(with_parts, f"{kind}-3")
 
     if kind in MOVED:
         assert corrupted.parts is not None
@@ -238,7 +408,8 @@ def with_channels(clouds):
     normals = torch.nn.functional.normalize(clouds.points, dim=2)
     rows = torch.arange(N).expand(4, N)
     intensity = rows[..., None].float()
-    return clouds._replace(points=torch.cat([normals, intensity, normals], 2))
+    points = torch.cat([normals, intensity, normals], 2)
+    return clouds._replace(points=points)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -250,7 +421,7 @@ def test_coordinates_are_corrupted_as_without_channels(clouds, kind):
     corrupted = corrupt(given, spec, NORMALS).points
 
     without_channels = corrupt(given._replace(points=coordinates), spec).points
-    torch.testing.assert_close(corrupted[..., :3], without_channels)
+    assert_close(corrupted[..., :3], without_channels)
 
 
 @pytest.mark.parametrize("kind", SHRUNK)
@@ -260,7 +431,8 @@ def test_removal_keeps_the_channels_of_points(clouds, kind):
     corrupted = corrupt(given, f"{kind}-3", NORMALS).points
 
     for cloud, before in zip(corrupted, given.points, strict=True):
-        assert torch.equal(cloud, before[cloud[:, 3].long()])
+        rows = cloud[:, 3].long()
+        assert torch.equal(cloud, before[rows])
 
 
 @pytest.mark.parametrize("kind", GROWN)
@@ -275,12 +447,16 @@ def test_added_points_have_the_channels_of_points_of_the_cloud(clouds, kind):
         normals = before[rows, 4:]
         assert torch.equal(after[:N], before)
         assert torch.equal(added[:, 4:], normals)
+        assert rows.tolist() != list(range(len(added)))
 
 
 def test_rotation_turns_normals(clouds):
-    corrupted = corrupt(with_channels(clouds), "rotation-5", NORMALS).points
+    given = with_channels(clouds)
 
-    torch.testing.assert_close(corrupted[..., 4:], corrupted[..., :3], atol=1e-5, rtol=1e-4)
+    corrupted = corrupt(given, "rotation-5", NORMALS).points
+
+    normals = corrupted[..., 4:]
+    assert_close(normals, corrupted[..., :3], atol=1e-5, rtol=1e-4)
 
 
 @pytest.mark.parametrize("kind", ["scaling", "shear"])
@@ -293,11 +469,13 @@ def test_linear_map_keeps_normals_normal_to_the_surface(clouds, kind):
     direction = torch.tensor([0.3, 0.5, 0.8]).expand(N, 3)
     for before, after in zip(given.points, corrupted, strict=True):
         sphere = before[:, :3]
-        homogeneous = torch.cat([sphere, torch.ones(N, 1)], 1)
+        ones = torch.ones(N, 1)
+        homogeneous = torch.cat([sphere, ones], 1)
         affine = linear_map(homogeneous, after[:, :3])
         tangents = torch.linalg.cross(sphere, direction)
         mapped = tangents @ affine[:3]
         normals = after[:, 4:]
         products = (mapped * normals).sum(1)
         assert products.abs().max() < 1e-4
-        torch.testing.assert_close(normals.norm(dim=1), torch.ones(N))
+        lengths = normals.norm(dim=1)
+        assert_close(lengths, torch.ones(N))

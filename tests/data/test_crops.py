@@ -7,6 +7,7 @@ import pytest
 
 from mops_lightning.data.crops import random_crops
 from mops_lightning.data.formats.guard import BadCloudError
+from tests.support.clouds import uniform_points
 
 PATH = Path("scan.ply")
 FAR = np.array([431_000.0, 5_412_000.0, 120.0])
@@ -55,7 +56,7 @@ def test_random_crops_of_coincident_points_raises():
 
 
 def test_tiles_have_every_point_as_their_own_once():
-    unit = np.random.default_rng(0).random((1000, 3))
+    unit = uniform_points(1000, 0)
     points = unit * [100, 60, 5] + 5e5
 
     tiles = cut(points, 96)
@@ -68,7 +69,7 @@ def test_tiles_have_every_point_as_their_own_once():
 
 
 def test_tiles_are_filled_up_by_near_points_of_other_tiles():
-    unit = np.random.default_rng(0).random((1000, 3))
+    unit = uniform_points(1000, 0)
     points = unit * [100, 60, 5]
 
     tiles = cut(points, 96)
@@ -85,7 +86,7 @@ def test_tiles_are_filled_up_by_near_points_of_other_tiles():
 
 
 def test_tiles_of_as_many_points_as_a_tile_are_the_whole_cloud():
-    points = np.random.default_rng(0).random((50, 3))
+    points = uniform_points(50, 0)
 
     tiles = cut(points, 50)
 

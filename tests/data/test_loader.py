@@ -3,6 +3,7 @@ import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from mops_lightning.channels import Channel, PointChannels
 from mops_lightning.data.clouds import Clouds
@@ -13,7 +14,8 @@ from mops_lightning.seeding import generator
 
 def clouds(number=10, points=7):
     rng = torch.Generator().manual_seed(0)
-    return Clouds(torch.randn(number, points, 3, generator=rng), torch.arange(number))
+    normal = torch.randn(number, points, 3, generator=rng)
+    return Clouds(normal, torch.arange(number))
 
 
 def labels(loader):
@@ -23,7 +25,12 @@ def labels(loader):
 def test_loader_without_shuffle_keeps_order_also_after_an_interrupted_iteration():
     loader = CloudLoader(clouds(), 4)
     next(iter(loader))
-    assert labels(loader) == labels(loader) == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9]]
+
+    first = labels(loader)
+    second = labels(loader)
+
+    assert first == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9]]
+    assert second == first
     assert len(loader) == 3
 
 
@@ -49,8 +56,11 @@ def test_loader_order_depends_on_seed_and_epoch():
 
 
 def test_loader_drop_last_keeps_only_batch():
-    assert len(CloudLoader(clouds(), 4, drop_last=True)) == 2
-    assert len(CloudLoader(clouds(), 32, drop_last=True)) == 1
+    several = CloudLoader(clouds(), 4, drop_last=True)
+    only = CloudLoader(clouds(), 32, drop_last=True)
+
+    assert len(several) == 2
+    assert len(only) == 1
 
 
 def test_loader_augments_anew_in_every_batch_and_epoch():
@@ -69,11 +79,34 @@ def test_loader_augments_anew_in_every_batch_and_epoch():
 
 def test_augmentation_jitter_is_clipped(rng, monkeypatch):
     points = torch.zeros(8, 5000, 3)
-    noise = Augmentation(jitter=0.1)(points, rng)
-    assert noise.std().item() == pytest.approx(0.1, rel=0.02)
+    augment = Augmentation(jitter=0.1)
+
+    noise = augment(points, rng)
     monkeypatch.setattr("mops_lightning.data.loader.JITTER_CLIP", 2)
-    clipped = Augmentation(jitter=0.1)(points, rng)
+    clipped = augment(points, rng)
+
+    assert noise.std().item() == pytest.approx(0.1, rel=0.02)
     assert clipped.abs().max() == pytest.approx(0.2)
+
+
+def test_augmentation_jitter_is_clipped_at_five_standard_deviations():
+    points = torch.zeros(1, 1_000_000, 3)
+    unclipped = torch.randn(points.shape, generator=torch.Generator().manual_seed(0))
+    assert unclipped.abs().max() > 5
+
+    noise = Augmentation(jitter=1.0)(points, torch.Generator().manual_seed(0))
+
+    assert torch.equal(noise, unclipped.clamp(-5, 5))
+
+
+def test_augmentation_shifts_without_stretching(rng):
+    points = clouds(300).points
+
+    shifted = Augmentation(shift=0.2)(points, rng)
+
+    offset = shifted[:, 0] - points[:, 0]
+    assert_close(shifted, points + offset[:, None], atol=1e-5, rtol=0)
+    assert_drawn_for_every_axis(offset, -0.2, 0.2)
 
 
 def test_augmentation_stretches_and_shifts_every_axis_of_a_cloud(rng):
@@ -87,7 +120,7 @@ def test_augmentation_stretches_and_shifts_every_axis_of_a_cloud(rng):
     scale = changed_edge / edge
     offset = changed[:, 0] - scale * points[:, 0]
     expected = points * scale[:, None] + offset[:, None]
-    torch.testing.assert_close(changed, expected, atol=1e-3, rtol=0)
+    assert_close(changed, expected, atol=1e-3, rtol=0)
     assert_drawn_for_every_axis(scale, 1 / 1.5, 1.5)
     assert_drawn_for_every_axis(offset, -0.2, 0.2)
 
@@ -97,7 +130,8 @@ def assert_drawn_for_every_axis(drawn, low, high):
     assert low - 1e-3 < drawn.min() < low + 0.05
     assert high - 0.05 < drawn.max() < high + 1e-3
     middle = (low + high) / 2
-    assert drawn.mean().item() == pytest.approx(middle, abs=0.05)
+    mean = drawn.mean().item()
+    assert mean == pytest.approx(middle, abs=0.05)
     between_axes = torch.corrcoef(drawn.T) - torch.eye(3)
     assert between_axes.abs().max() < 0.2
 
@@ -117,7 +151,8 @@ def test_augmentation_equals_written_out_formulas():
     turned_x = x * cos - z * sin
     turned_z = x * sin + z * cos
     turned = torch.stack([turned_x, y, turned_z], 2)
-    torch.testing.assert_close(augmented, turned + noise.clamp(-0.2, 0.2))
+    expected = turned + noise.clamp(-0.2, 0.2)
+    assert_close(augmented, expected)
 
 
 @pytest.mark.parametrize("up", ["x", "y", "z"])
@@ -132,8 +167,10 @@ def test_augmentation_turns_about_its_vertical_axis(up):
     turned = about_up(points, torch.Generator().manual_seed(3))
 
     turned_about_y = about_y(moved, torch.Generator().manual_seed(3))
-    torch.testing.assert_close(turned[..., axis], points[..., axis])
-    torch.testing.assert_close(turned, turned_about_y.roll(axis - 1, 2))
+    expected = turned_about_y.roll(axis - 1, 2)
+    heights = turned[..., axis]
+    assert_close(heights, points[..., axis])
+    assert_close(turned, expected)
     assert not torch.allclose(turned, points)
 
 
@@ -142,6 +179,10 @@ def test_augmentation_invalid_argument_raises():
         Augmentation(rotate_up="w")  # type: ignore[arg-type]
     with pytest.raises(UserError, match=r"jitter .* at least 0, got -1.0"):
         Augmentation(jitter=-1.0)
+    with pytest.raises(UserError, match=r"shift .* at least 0, got -0.1"):
+        Augmentation(shift=-0.1)
+    with pytest.raises(UserError, match=r"stretch .* at least 1, got 0.9"):
+        Augmentation(stretch=0.9)
 
 
 def test_augmentation_without_settings_changes_nothing():
@@ -168,8 +209,9 @@ def test_loader_task_draws_by_cloud_and_in_training_by_epoch(shuffle):
         labelled = []
         for cloud, rng in zip(points, generators, strict=True):
             is_cloud = (known == cloud).all((1, 2))
+            label = int(is_cloud.nonzero())
             number = float(torch.rand((), generator=rng))
-            labelled.append((int(is_cloud.nonzero()), number))
+            labelled.append((label, number))
         return labelled
 
     def loader(batch_size=4, seed=5):
@@ -194,17 +236,20 @@ def test_loader_task_draws_by_cloud_and_in_training_by_epoch(shuffle):
     else:
         assert first_epoch == numbers_of_stream(11, 5)
         assert second_epoch == first_epoch
-        batch = loader().batch_of(torch.tensor([7, 2]))
+        rows = torch.tensor([7, 2])
+        batch = loader().batch_of(rows)
         assert batch == [(7, first_epoch[7]), (2, first_epoch[2])]
     assert drawn(loader(batch_size=3)) == first_epoch
     assert drawn(loader(seed=6)) != first_epoch
 
 
 def loaders(number, processes, batch_size=8, **extra):
-    return [
-        CloudLoader(clouds(number), batch_size, part=(rank, processes), **extra)
-        for rank in range(processes)
-    ]
+    split = clouds(number)
+    shares = []
+    for rank in range(processes):
+        loader = CloudLoader(split, batch_size, part=(rank, processes), **extra)
+        shares.append(loader)
+    return shares
 
 
 @pytest.mark.parametrize("number", [16, 29])
@@ -215,9 +260,11 @@ def test_loader_shares_of_training_batch_form_whole_batch(number):
     first, second = loaders(number, 2, **settings)
 
     for whole, left, right in zip(alone, first, second, strict=True):
+        points = torch.cat([left.points, right.points])
+        labels = torch.cat([left.labels, right.labels])
         assert len(left.points) == len(right.points)
-        assert torch.equal(torch.cat([left.points, right.points]), whole.points)
-        assert torch.equal(torch.cat([left.labels, right.labels]), whole.labels)
+        assert torch.equal(points, whole.points)
+        assert torch.equal(labels, whole.labels)
 
 
 def test_loader_indivisible_batch_drops_last_clouds():
@@ -241,11 +288,17 @@ def test_loader_test_split_scores_each_cloud_once(processes):
             for batch in batches:
                 assert len(batch.points) > 0
                 seen.extend(batch.labels.tolist())
-        assert sorted(seen) == list(range(number))
+        everything = list(range(number))
+        assert sorted(seen) == everything
 
 
 INTENSITY_AND_NORMALS = PointChannels(
-    [Channel("intensity"), Channel("normal_x"), Channel("normal_y"), Channel("normal_z")]
+    [
+        Channel("intensity"),
+        Channel("normal_x"),
+        Channel("normal_y"),
+        Channel("normal_z"),
+    ]
 )
 
 
@@ -271,7 +324,7 @@ def test_augmentation_turns_normals_with_the_cloud(up, rng):
 
     coordinates, intensity, _ = split_channels(points)
     turned_coordinates, turned_intensity, turned_normals = split_channels(turned)
-    torch.testing.assert_close(turned_normals, turned_coordinates)
+    assert_close(turned_normals, turned_coordinates)
     assert torch.equal(turned_intensity, intensity)
     assert not torch.allclose(turned_coordinates, coordinates)
 
@@ -289,27 +342,69 @@ def test_augmentation_keeps_normals_normal_to_a_stretched_surface(rng):
     # The normal of an ellipsoid with the half axes a is x / a².
     gradient = stretched_coordinates / half_axes.square()
     expected = torch.nn.functional.normalize(gradient, dim=2)
-    torch.testing.assert_close(stretched_normals, expected, atol=1e-5, rtol=1e-4)
+    assert_close(stretched_normals, expected, atol=1e-5, rtol=1e-4)
     assert torch.equal(stretched_intensity, intensity)
 
 
 def test_augmentation_moves_coordinates_as_without_channels(rng):
     points = sphere(rng)
+    coordinates = points[..., :3].contiguous()
     augment = Augmentation("z", 0.1, 2.0, 0.3)
 
     with_channels = augment(points, generator(1), INTENSITY_AND_NORMALS)
-    without = augment(points[..., :3].contiguous(), generator(1))
+    without = augment(coordinates, generator(1))
 
-    torch.testing.assert_close(with_channels[..., :3], without)
+    assert_close(with_channels[..., :3], without)
 
 
 def test_loader_gives_channels_to_the_augmentation(rng):
     points = sphere(rng)
     split = Clouds(points, torch.arange(2))
-    loader = CloudLoader(
-        split, 2, augment=Augmentation(rotate_up="z"), channels=INTENSITY_AND_NORMALS
-    )
+    augment = Augmentation(rotate_up="z")
+    loader = CloudLoader(split, 2, augment=augment, channels=INTENSITY_AND_NORMALS)
 
     (batch,) = list(loader)
 
-    torch.testing.assert_close(batch.points[..., 4:], batch.points[..., :3])
+    coordinates, _, normals = split_channels(batch.points)
+    assert_close(normals, coordinates)
+
+
+@pytest.mark.parametrize(
+    ("settings", "keeps"),
+    [
+        ({}, True),
+        ({"shuffle": True}, True),
+        ({"augment": Augmentation()}, True),
+        ({"augment": Augmentation(jitter=0.1)}, False),
+        ({"make_batch": lambda points, _: points}, False),
+    ],
+    ids=["plain", "shuffled", "augmentation of nothing", "augmented", "converted"],
+)
+def test_loader_keeps_clouds_that_nothing_changes(settings, keeps):
+    loader = CloudLoader(clouds(), 4, **settings)
+
+    assert loader.keeps_clouds == keeps
+
+
+@pytest.mark.parametrize(("shuffle", "keeps"), [(False, True), (True, False)])
+def test_loader_of_different_sizes_keeps_clouds_only_without_shuffle(shuffle, keeps):
+    split = clouds()._replace(sizes=torch.arange(1, 11))
+
+    loader = CloudLoader(split, 4, shuffle)
+
+    assert loader.keeps_clouds == keeps
+
+
+@pytest.mark.parametrize("number_seen", [1, 2])
+def test_loader_continues_from_a_saved_position_with_the_rest_of_the_epoch(number_seen):
+    loader = CloudLoader(clouds(), 4, shuffle=True)
+    epoch = labels(CloudLoader(clouds(), 4, shuffle=True))
+    batches = iter(loader)
+    for _ in range(number_seen):
+        next(batches)
+    resumed = CloudLoader(clouds(), 4, shuffle=True)
+
+    resumed.load_state_dict(loader.state_dict())
+
+    assert labels(resumed) == epoch[number_seen:]
+    assert len(labels(resumed)) == 3

@@ -7,6 +7,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_array_equal
 
 from mops_lightning.data import modelnet
 from mops_lightning.data.modelnet import FOLDER, modelnet40
@@ -53,7 +54,7 @@ def test_modelnet_reads_all_shapes_in_order(split, layout):
         for row in range(5):
             expected.append(cloud(split, number, row))
     assert dataset.class_names == NAMES
-    np.testing.assert_array_equal(clouds.points.numpy(), np.stack(expected))
+    assert_array_equal(clouds.points.numpy(), np.stack(expected))
     assert clouds.labels.tolist() == [0, 1, 2, 0, 1] * len(FILES[split])
     assert clouds.points.dtype == torch.float32
     assert clouds.labels.dtype == torch.int64

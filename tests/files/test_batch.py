@@ -5,6 +5,7 @@ import os
 import numpy as np
 
 from mops_lightning.files import batch
+from tests.support.clouds import uniform_points
 from tests.support.downsample import call, done
 
 
@@ -36,7 +37,7 @@ def test_folder_counts_the_points_left_out_of_all_files(tmp_path):
     source = tmp_path / "in"
     source.mkdir()
     for missing in (1, 2, 4):
-        points = np.random.default_rng(missing).random((20, 3))
+        points = uniform_points(20, missing)
         points[:missing] = np.nan
         np.save(source / f"{missing}.npy", points)
 

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mops_lightning.data.formats.registry import WRITERS, read
-from mops_lightning.data.formats.table import Table
+from tests.support.cloud_files import contents, write_cloud
 from tests.support.downsample import call, done, refused
 
 RNG = np.random.default_rng(0)
@@ -27,14 +26,14 @@ def clouds(tmp_path_factory):
             "classification": classes,
             "row": np.arange(number, dtype=np.int32),
         }
-        WRITERS[".ply"](folder / f"{name}.ply", Table(points, columns))
+        write_cloud(folder / f"{name}.ply", points, columns)
     (folder / "notes.md").write_text("two files of other kinds\n")
     (folder / "scan.xyzzy").write_text("1 2 3\n")
     return folder
 
 
 def number_of_points(path):
-    return len(read(path, 9, 0).points)
+    return len(contents(path).points)
 
 
 def sizes_of(folder):
@@ -46,11 +45,11 @@ def sizes_of(folder):
 
 
 def write_normal(path, number):
-    WRITERS[".ply"](path, Table(RNG.normal(size=(number, 3))))
+    write_cloud(path, RNG.normal(size=(number, 3)))
 
 
 def classes_of(path):
-    return dict(Counter(read(path, 9, 0).columns["classification"].tolist()))
+    return dict(Counter(contents(path).columns["classification"].tolist()))
 
 
 @pytest.mark.parametrize("chunk", [[], ["--chunk", 200]])
@@ -170,7 +169,7 @@ def test_stratify_with_chunk_draws_a_class_from_all_of_the_file(clouds, tmp_path
     options = ["--method", "random", "--m", 60, "--stratify", "class:share", "--chunk", 60]
     done(clouds / "a.ply", tmp_path / "out.ply", *options)
 
-    kept = read(tmp_path / "out.ply", 9, 0)
+    kept = contents(tmp_path / "out.ply")
     rows = kept.columns["row"][kept.columns["classification"] == 1]  # of rows 120 to 599
     assert rows.min() < 180
     assert 320 < rows.mean() < 400
@@ -199,7 +198,7 @@ def test_space_makes_a_column_count(method, clouds, tmp_path):
 
     done(clouds / "a.ply", small, "--method", method, "--m", 2, "--space", "row")
 
-    first, second = read(small, 9, 0).columns["row"].tolist()
+    first, second = contents(small).columns["row"].tolist()
     assert abs(first - second) >= 290
 
 
@@ -210,11 +209,11 @@ def test_space_with_another_column_keeps_all_coordinates(tmp_path):
     upright = np.zeros((100, 3))
     upright[:, 2] = height
     grey = np.resize([0, 1], 100).astype(np.uint8)
-    WRITERS[".ply"](source, Table(upright, {"grey": grey}))
+    write_cloud(source, upright, {"grey": grey})
 
     done(source, small, "--method", "fps", "--m", 9, "--space", "grey=0.01")
 
-    kept = read(small, 9, 0).points
+    kept = contents(small).points
     to_kept = np.abs(height[:, None] - kept[:, 2])
     assert to_kept.min(axis=1).max() <= 100 / 8
 

@@ -6,11 +6,13 @@ from typing import Any
 import laspy
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
-from mops_lightning.data.formats.registry import WRITERS, read
-from mops_lightning.data.formats.table import Table
+from mops_lightning.data.formats.registry import read
 from mops_lightning.files import by_distance
 from mops_lightning.ops.spacing import keep_spaced
+from tests.support.cloud_files import contents, write_cloud
+from tests.support.clouds import uniform_points
 from tests.support.downsample import done, refused
 
 RNG = np.random.default_rng(0)
@@ -39,7 +41,7 @@ def scan(tmp_path_factory):
         "ny": normals[:, 1],
         "nz": normals[:, 2],
     }
-    WRITERS[".ply"](path, Table(points, columns))
+    write_cloud(path, points, columns)
     return path
 
 
@@ -73,7 +75,7 @@ def test_mean_of_a_voxel_with_one_point_is_this_point_to_the_last_bit(tmp_path):
 
 def test_spacing_in_many_passes_counts_the_points_of_all_ranges(tmp_path):
     source = tmp_path / "in.npy"
-    points = np.random.default_rng(0).random((200, 3))
+    points = uniform_points(200, 0)
     points[:20] *= 0.01  # one of these is kept early: the first ranges have no more to offer
     points[7] = np.nan
     np.save(source, points)
@@ -88,7 +90,7 @@ def test_spacing_in_many_passes_counts_the_points_of_all_ranges(tmp_path):
 @pytest.mark.parametrize("budget", BUDGETS)
 def test_chunks_and_tiles_equal_one_pass(budget, scan, tmp_path):
     done(scan, tmp_path / "whole.npz", *BUDGETS[budget])
-    whole = read(tmp_path / "whole.npz", 9, 0)
+    whole = contents(tmp_path / "whole.npz")
 
     for name, options in {
         "1000": ["--chunk", 1000],
@@ -97,15 +99,11 @@ def test_chunks_and_tiles_equal_one_pass(budget, scan, tmp_path):
         "tile": ["--tile", 64],
     }.items():
         done(scan, tmp_path / f"{name}.npz", *BUDGETS[budget], *options)
-        part = read(tmp_path / f"{name}.npz", 9, 0)
-        np.testing.assert_array_equal(part.points, whole.points)
+        part = contents(tmp_path / f"{name}.npz")
+        assert_array_equal(part.points, whole.points)
         assert part.columns.keys() == whole.columns.keys()
         for column, values in whole.columns.items():
-            np.testing.assert_array_equal(part.columns[column], values)
-
-
-def contents(path):
-    return read(path, 9, 0)
+            assert_array_equal(part.columns[column], values)
 
 
 def test_spacing_keeps_rows_of_the_op(scan, tmp_path):
@@ -116,8 +114,8 @@ def test_spacing_keeps_rows_of_the_op(scan, tmp_path):
     kept = contents(result)
     whole = contents(scan).finite()
     rows = keep_spaced(whole.points, 0.7)
-    np.testing.assert_array_equal(kept.points, whole.points[rows])
-    np.testing.assert_array_equal(kept.columns["row"], whole.columns["row"][rows])
+    assert_array_equal(kept.points, whole.points[rows])
+    assert_array_equal(kept.columns["row"], whole.columns["row"][rows])
     assert f"{len(rows)} of 899 points (1 more without finite coordinates left out)" in out
 
 
@@ -131,7 +129,7 @@ def test_voxel_keeps_one_row_of_each_and_prints_the_origin(scan, tmp_path):
     cells = np.floor(whole.finite().points / 0.8)
     occupied = np.unique(cells, axis=0)
     assert len(kept.points) == len(occupied)
-    np.testing.assert_array_equal(kept.points, whole.points[kept.columns["row"]])
+    assert_array_equal(kept.points, whole.points[kept.columns["row"]])
     assert "voxels of 0.8 from the origin 0 0 0" in out
 
 
@@ -156,7 +154,7 @@ def test_voxel_means_average_coordinates(axis, voxel_means):
 
     expected = mean_by_voxel(voxel, whole.points[:, axis])
 
-    np.testing.assert_allclose(means.points[:, axis], expected, rtol=0, atol=2e-8)
+    assert_allclose(means.points[:, axis], expected, rtol=0, atol=2e-8)
 
 
 def test_voxel_means_average_quantities_and_renormalise_normals(voxel_means):
@@ -165,10 +163,10 @@ def test_voxel_means_average_quantities_and_renormalise_normals(voxel_means):
     heat = mean_by_voxel(voxel, whole.columns["heat"])
     red = mean_by_voxel(voxel, whole.columns["red"])
 
-    np.testing.assert_allclose(means.columns["heat"], heat, rtol=1e-9, atol=1e-3)
-    np.testing.assert_allclose(means.columns["red"], red, atol=0.5)
+    assert_allclose(means.columns["heat"], heat, rtol=1e-9, atol=1e-3)
+    assert_allclose(means.columns["red"], red, atol=0.5)
     normals = [means.columns["nx"], means.columns["ny"], means.columns["nz"]]
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=0), 1.0)
+    assert_allclose(np.linalg.norm(normals, axis=0), 1.0)
 
 
 def test_voxel_means_keep_the_row_of_a_point_of_their_voxel(voxel_means):
@@ -176,7 +174,7 @@ def test_voxel_means_keep_the_row_of_a_point_of_their_voxel(voxel_means):
 
     places = np.searchsorted(whole.columns["row"], means.columns["row"])
 
-    np.testing.assert_array_equal(voxel[places], np.arange(voxel.max() + 1))
+    assert_array_equal(voxel[places], np.arange(voxel.max() + 1))
 
 
 @pytest.mark.parametrize("chunk", [[], ["--chunk", 2]])
@@ -192,14 +190,14 @@ def test_voxel_mean_of_a_missing_value_is_missing(chunk, tmp_path):
         ]
     )
     heat = np.array([1.0, np.nan, 3.0, 7.0])
-    WRITERS[".ply"](source, Table(points, {"heat": heat}))
+    write_cloud(source, points, {"heat": heat})
 
     done(source, result, "--voxel", 1, "--readout", "generated", *chunk)
 
     means = contents(result)
     expected = [[0.2, 0.2, 0.2], [1.5, 0.5, 0.5]]
-    np.testing.assert_allclose(means.points, expected, atol=1e-9)
-    np.testing.assert_array_equal(means.columns["heat"], [np.nan, 7.0])
+    assert_allclose(means.points, expected, atol=1e-9)
+    assert_array_equal(means.columns["heat"], [np.nan, 7.0])
 
 
 def test_voxel_means_renormalise_normals_by_the_names_of_pcl(tmp_path):
@@ -217,7 +215,7 @@ def test_voxel_means_renormalise_normals_by_the_names_of_pcl(tmp_path):
         "normal_y": np.array([0.0, 1.0, 0.0], np.float32),
         "normal_z": np.array([0.0, 0.0, 0.0], np.float32),
     }
-    WRITERS[".pcd"](source, Table(points, columns))
+    write_cloud(source, points, columns)
 
     done(source, result, "--voxel", 1, "--readout", "generated")
 
@@ -276,7 +274,7 @@ def test_chunk_of_one_point_reads_longer_ranges(budget, tmp_path, monkeypatch):
     whole = tmp_path / "whole.ply"
     parts = tmp_path / "parts.ply"
     monkeypatch.setattr(by_distance, "LEAST_CHUNK", 4096)
-    WRITERS[".ply"](source, Table(RNG.normal(size=(5000, 3))))
+    write_cloud(source, RNG.normal(size=(5000, 3)))
     done(source, whole, budget, 2.5)
     ranges: list[range] = []
     monkeypatch.setattr(by_distance, "_read", watched(by_distance._read, ranges))
@@ -300,7 +298,7 @@ def watched(read_part, ranges):
 def test_weights_of_zero_are_named(budget, options, tmp_path):
     source = tmp_path / "in.ply"
     points = RNG.normal(size=(20, 3))
-    WRITERS[".ply"](source, Table(points, {"w": np.zeros(20)}))
+    write_cloud(source, points, {"w": np.zeros(20)})
 
     words = refused(source, tmp_path / "out.ply", budget, 1, "--weight", "w", *options)
 
@@ -324,9 +322,9 @@ def test_real_scans_in_chunks_equal_one_pass(name, distance, budget, real_data, 
     whole = contents(tmp_path / "whole.las")
     parts = contents(tmp_path / "parts.las")
     assert len(whole.points) > 100
-    np.testing.assert_array_equal(parts.points, whole.points)
+    assert_array_equal(parts.points, whole.points)
     for column, values in whole.columns.items():
-        np.testing.assert_array_equal(parts.columns[column], values)
+        assert_array_equal(parts.columns[column], values)
 
 
 @pytest.mark.parametrize(("kind", "is_refused"), [(2, True), (1, False)])

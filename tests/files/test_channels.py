@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mops_lightning import downsample, load
 from mops_lightning.channels import Channel, PointChannels
-from mops_lightning.data.formats.registry import WRITERS, read
 from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import UserError
 from mops_lightning.files.compare import compare_file, options_by_method
@@ -17,6 +17,8 @@ from mops_lightning.files.icp.methods import ByWeights
 from mops_lightning.ops.normals import upward_normals
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.zoo import weights
+from tests.support.cloud_files import contents, write_table
+from tests.support.clouds import normal_points
 from tests.support.downsample import done, refused
 
 N = 300
@@ -28,12 +30,17 @@ NORMALS = [Channel("normal_x"), Channel("normal_y"), Channel("normal_z")]
 def save(path, *channels):
     """Write an FMOPS-Net with channels whose samples depend on them; return the file."""
     torch.manual_seed(0)
-    settings: dict[str, Any] = {"m_max": 16, "feature_channels": [16, 8], "rho_channels": [12, 10]}
-    net = FMOPSNet(point_channels=PointChannels(channels), **settings)
+    settings: dict[str, Any] = {
+        "m_max": 16,
+        "feature_channels": [16, 8],
+        "rho_channels": [12, 10],
+    }
+    point_channels = PointChannels(channels)
+    net = FMOPSNet(point_channels=point_channels, **settings)
     net.queries.weight.data *= 100  # columns of S choose a few points, by their channels, too
     target = "mops_lightning.samplers.fmops.FMOPSNet"
     config = {"learn": "sampler", "m": 16, "sampler": {"_target_": target, **settings}}
-    weights.save(path, net, config, {}, channels=PointChannels(channels))
+    weights.save(path, net, config, {}, channels=point_channels)
     return path
 
 
@@ -50,7 +57,9 @@ def table():
         "time": rng.random(N),
         "Intensity": rng.integers(0, 255, N).astype(np.uint16),
     }
-    return Table(rng.normal(size=(N, 3)) * [9, 5, 1] + 1000, columns)
+    unit = rng.normal(size=(N, 3))
+    points = unit * [9, 5, 1] + 1000
+    return Table(points, columns)
 
 
 def matrix(table, *names):
@@ -58,31 +67,34 @@ def matrix(table, *names):
     return np.column_stack([table.points, *columns])
 
 
-def contents(path):
-    return read(path, 9, 0)
-
-
 GENERATED = ["--m", 9, "--readout", "generated"]
+
+
+def generated_by(model, points):
+    """Return the 9 points that a model generates in Python."""
+    generated, _ = load(model).downsample(points, 9, readout="generated")
+    return generated
 
 
 def test_columns_are_found_by_name_in_any_order(model, table, tmp_path):
     source = tmp_path / "in.npz"
     out = tmp_path / "out.npz"
-    WRITERS[".npz"](source, table)
+    write_table(source, table)
 
     done(source, out, "--weights", model, "--m", 9)
 
     kept = contents(out)
-    expected, rows = load(model).downsample(matrix(table, "Intensity", "ring"), 9)
-    np.testing.assert_array_equal(kept.points, expected[:, :3])
+    given = matrix(table, "Intensity", "ring")
+    expected, rows = load(model).downsample(given, 9)
+    assert_array_equal(kept.points, expected[:, :3])
     for name, column in table.columns.items():
-        np.testing.assert_array_equal(kept.columns[name], column[rows])
+        assert_array_equal(kept.columns[name], column[rows])
 
 
 def test_generated_points_have_channels_in_the_types_of_the_file(model, table, tmp_path):
     source = tmp_path / "in.npz"
     out = tmp_path / "out.npz"
-    WRITERS[".npz"](source, table)
+    write_table(source, table)
 
     done(source, out, "--weights", model, *GENERATED)
 
@@ -90,110 +102,123 @@ def test_generated_points_have_channels_in_the_types_of_the_file(model, table, t
     intensity = generated.columns["Intensity"]
     ring = generated.columns["ring"]
     given = matrix(table, "Intensity", "ring")
-    expected, _ = load(model).downsample(given, 9, readout="generated")
+    expected = generated_by(model, given)
     assert list(generated.columns) == ["Intensity", "ring"]
-    np.testing.assert_allclose(generated.points, expected[:, :3], rtol=1e-6)
+    assert_allclose(generated.points, expected[:, :3], rtol=1e-6)
     assert intensity.dtype == np.uint16
-    np.testing.assert_allclose(intensity, expected[:, 3], atol=0.51)
-    np.testing.assert_allclose(ring, expected[:, 4], atol=0.51)
+    assert_allclose(intensity, expected[:, 3], atol=0.51)
+    assert_allclose(ring, expected[:, 4], atol=0.51)
 
 
 def test_generated_columns_after_normals_are_their_own(table, tmp_path):
     model = save(tmp_path / "model.safetensors", *NORMALS, INTENSITY)
     source = tmp_path / "in.npz"
     out = tmp_path / "out.npz"
-    normals = np.random.default_rng(1).normal(size=(N, 3))
+    normals = normal_points(N, 1)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     names = ("nx", "ny", "nz")
-    table = table.with_columns(dict(zip(names, normals.T, strict=True)))
-    WRITERS[".npz"](source, table)
+    columns = dict(zip(names, normals.T, strict=True))
+    table = table.with_columns(columns)
+    write_table(source, table)
 
     done(source, out, "--weights", model, *GENERATED)
 
     generated = contents(out).columns
     given = matrix(table, *names, "Intensity")
-    expected, _ = load(model).downsample(given, 9, readout="generated")
+    expected = generated_by(model, given)
     found = np.stack([generated[name] for name in names], 1)
-    np.testing.assert_allclose(found, expected[:, 3:6], atol=1e-5)
-    np.testing.assert_allclose(generated["Intensity"], expected[:, 6], atol=0.51)
+    assert_allclose(found, expected[:, 3:6], atol=1e-5)
+    assert_allclose(generated["Intensity"], expected[:, 6], atol=0.51)
 
 
 def test_generated_points_without_attributes_have_coordinates_only(model, table, tmp_path):
-    WRITERS[".npz"](tmp_path / "in.npz", table)
+    source = tmp_path / "in.npz"
+    out = tmp_path / "out.npz"
+    write_table(source, table)
 
-    settings = ["--weights", model, "--m", 9, "--readout", "generated", "--coordinates-only"]
-    done(tmp_path / "in.npz", tmp_path / "out.npz", *settings)
+    done(source, out, "--weights", model, *GENERATED, "--coordinates-only")
 
-    assert not read(tmp_path / "out.npz", 9, 0).columns
+    assert not contents(out).columns
 
 
 def test_upward_normals_are_written_with_length_one(table, tmp_path):
     source = tmp_path / "in.ply"
     out = tmp_path / "out.ply"
     model = save(tmp_path / "model.safetensors", *NORMALS)
-    WRITERS[".ply"](source, table)
+    write_table(source, table)
 
     done(source, out, "--weights", model, *GENERATED)
 
     columns = contents(out).columns
-    normals = np.column_stack([columns["nx"], columns["ny"], columns["nz"]])
+    parts = [columns[name] for name in ("nx", "ny", "nz")]
+    normals = np.column_stack(parts)
     lengths = np.linalg.norm(normals, axis=1)
-    np.testing.assert_allclose(lengths, np.ones(9), atol=1e-6)
-    given = np.column_stack([table.points, upward_normals(table.points)])
-    expected, _ = load(model).downsample(given, 9, readout="generated")
-    np.testing.assert_allclose(normals, expected[:, 3:], atol=1e-4)
+    assert_allclose(lengths, np.ones(9), atol=1e-6)
+    upward = upward_normals(table.points)
+    given = np.column_stack([table.points, upward])
+    expected = generated_by(model, given)
+    assert_allclose(normals, expected[:, 3:], atol=1e-4)
 
 
 @pytest.mark.parametrize("readout", ["generated", "matched"])
 def test_chunks_equal_the_whole_file(readout, model, table, tmp_path):
     source = tmp_path / "in.ply"
-    WRITERS[".ply"](source, table)
+    in_whole = tmp_path / "whole.npz"
+    in_parts = tmp_path / "parts.npz"
+    write_table(source, table)
     settings = ["--weights", model, "--m", 9, "--readout", readout]
 
-    done(source, tmp_path / "whole.npz", *settings)
-    done(source, tmp_path / "parts.npz", *settings, "--chunk", 70)
+    done(source, in_whole, *settings)
+    done(source, in_parts, *settings, "--chunk", 70)
 
-    whole = contents(tmp_path / "whole.npz")
-    parts = contents(tmp_path / "parts.npz")
-    np.testing.assert_allclose(parts.points, whole.points, atol=1e-3)
+    whole = contents(in_whole)
+    parts = contents(in_parts)
+    assert_allclose(parts.points, whole.points, atol=1e-3)
     assert list(parts.columns) == list(whole.columns)
     for name, column in whole.columns.items():
-        np.testing.assert_allclose(parts.columns[name], column, atol=1)
+        assert_allclose(parts.columns[name], column, atol=1)
 
 
 def test_chunks_do_not_estimate_features(table, tmp_path):
     model = save(tmp_path / "model.safetensors", *NORMALS)
-    WRITERS[".ply"](tmp_path / "in.ply", table)
+    source = tmp_path / "in.ply"
+    out = tmp_path / "out.ply"
+    write_table(source, table)
 
-    settings = ["--weights", model, "--m", 9, "--readout", "generated", "--chunk", 70]
-    line = refused(tmp_path / "in.ply", tmp_path / "out.ply", *settings)
+    line = refused(source, out, "--weights", model, *GENERATED, "--chunk", 70)
 
     assert "in.ply has no columns of normals, which are estimated from all points of a file" in line
 
 
 def test_tiles_have_the_channels_of_their_points(model, table, tmp_path):
+    source = tmp_path / "in.npz"
+    out = tmp_path / "out.npz"
+    changed_source = tmp_path / "changed.npz"
+    changed_out = tmp_path / "changed_out.npz"
     reversed_intensity = table.columns["Intensity"][::-1].copy()
     changed = table.with_columns({"Intensity": reversed_intensity})
-    WRITERS[".npz"](tmp_path / "in.npz", table)
-    WRITERS[".npz"](tmp_path / "changed.npz", changed)
+    write_table(source, table)
+    write_table(changed_source, changed)
     settings = ["--weights", model, "--m", 20, "--tile", 100]
 
-    done(tmp_path / "in.npz", tmp_path / "out.npz", *settings)
-    done(tmp_path / "changed.npz", tmp_path / "other.npz", *settings)
+    done(source, out, *settings)
+    done(changed_source, changed_out, *settings)
 
-    kept = contents(tmp_path / "out.npz").points
-    kept_of_changed = contents(tmp_path / "other.npz").points
+    kept = contents(out).points
+    kept_of_changed = contents(changed_out).points
     given = matrix(table, "Intensity", "ring")
     in_python, _ = downsample(given, 20, model, tile=100)
-    np.testing.assert_array_equal(kept, in_python[:, :3])
+    assert_array_equal(kept, in_python[:, :3])
     assert not np.array_equal(kept, kept_of_changed)
 
 
 def test_file_without_a_column_is_refused_with_what_it_has(model, table, tmp_path):
+    source = tmp_path / "in.npz"
+    out = tmp_path / "out.npz"
     table.columns.pop("ring")
-    WRITERS[".npz"](tmp_path / "in.npz", table)
+    write_table(source, table)
 
-    line = refused(tmp_path / "in.npz", tmp_path / "out.npz", "--weights", model, "--m", 9)
+    line = refused(source, out, "--weights", model, "--m", 9)
 
     assert "--weights: " in line
     assert "in.npz has no column 'ring' of intensity, ring." in line
@@ -201,44 +226,51 @@ def test_file_without_a_column_is_refused_with_what_it_has(model, table, tmp_pat
 
 
 def test_missing_values_are_refused_with_their_number(model, table, tmp_path):
+    source = tmp_path / "in.npz"
+    out = tmp_path / "out.npz"
     intensity = table.columns["Intensity"].astype(np.float32)
     intensity[:7] = np.nan
-    WRITERS[".npz"](tmp_path / "in.npz", table.with_columns({"Intensity": intensity}))
+    broken = table.with_columns({"Intensity": intensity})
+    write_table(source, broken)
 
-    line = refused(tmp_path / "in.npz", tmp_path / "out.npz", "--weights", model, "--m", 9)
+    line = refused(source, out, "--weights", model, "--m", 9)
 
     assert "7 of 300 points of " in line
     assert "have no finite intensity." in line
 
 
 def test_python_takes_channels_after_the_coordinates(model, table):
-    given = torch.from_numpy(matrix(table, "Intensity", "ring"))
+    array = matrix(table, "Intensity", "ring")
+    given = torch.from_numpy(array)
 
     points, rows = downsample(given, 9, model)
-    generated, none = downsample(given, 9, model, readout="generated")
+    generated, no_rows = downsample(given, 9, model, readout="generated")
     (listed,), _ = downsample([given], 9, model)
 
     assert torch.equal(points, given[rows])
     assert torch.equal(listed, points)
-    assert (generated.shape, none) == ((9, 5), None)
+    assert generated.shape == (9, 5)
+    assert no_rows is None
 
 
 @pytest.mark.parametrize("columns", [3, 4, 6])
 def test_python_names_the_columns_that_a_model_takes(columns, model):
+    points = torch.rand(30, columns)
+
     with pytest.raises(UserError, match="x, y, z, intensity, ring"):
-        downsample(torch.rand(30, columns), 9, model)
+        downsample(points, 9, model)
 
 
 def test_compare_samples_with_channels(model, table, tmp_path):
     source = tmp_path / "in.npz"
-    WRITERS[".npz"](source, table)
+    write_table(source, table)
     methods = options_by_method(9, ["fps"], str(model), None, 0)
 
     comparison = compare_file(source, 9, methods, 0)
 
     given = matrix(table, "Intensity", "ring")
     _, expected = load(model).downsample(given, 9)
-    np.testing.assert_array_equal(comparison.results[-1].rows, expected)
+    assert_array_equal(comparison.results[-1].rows, expected)
 
 
 def test_registration_of_scans_refuses_channels(model):

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
-from mops_lightning.data.formats.registry import WRITERS, read
-from mops_lightning.data.formats.table import Table
 from mops_lightning.files import chunks
+from tests.support.cloud_files import contents, write_cloud
+from tests.support.clouds import normal_points
 from tests.support.downsample import call, done, refused
 
 
@@ -13,26 +14,26 @@ from tests.support.downsample import call, done, refused
 @pytest.mark.parametrize("readout", ["generated", "matched"])
 def test_chunks_equal_whole_file(suffix, readout, folder, tmp_path):
     source = tmp_path / f"in{suffix}"
-    points = np.random.default_rng(1).normal(size=(500, 3)).astype(np.float32).astype(float)
+    points = normal_points(500, 1).astype(np.float32).astype(float)
     points[200:] = np.tile(points[:100], (3, 1))  # of equal points, the first one is matched
     number = "40 of 500 points"
     if suffix != ".laz":  # it holds whole numbers, NaN is none
         points[100:160] = np.nan
         number = "40 of 440 points (60 more"
     intensity = np.arange(500, dtype=np.uint16)
-    WRITERS[suffix](source, Table(points, {"intensity": intensity}))
+    write_cloud(source, points, {"intensity": intensity})
     settings = ["--weights", folder, "--readout", readout]
 
     done(source, tmp_path / "whole.npz", *settings)
     out = done(source, tmp_path / "parts.npz", *settings, "--chunk", 60)
 
     assert number in out
-    whole = read(tmp_path / "whole.npz", 9, 0)
-    parts = read(tmp_path / "parts.npz", 9, 0)
-    np.testing.assert_allclose(parts.points, whole.points, atol=1e-5)
+    whole = contents(tmp_path / "whole.npz")
+    parts = contents(tmp_path / "parts.npz")
+    assert_allclose(parts.points, whole.points, atol=1e-5)
     assert list(parts.columns) == list(whole.columns)
     for name, column in whole.columns.items():
-        np.testing.assert_array_equal(parts.columns[name], column)
+        assert_array_equal(parts.columns[name], column)
 
 
 def drawn_by_parts(rows, number, seed):
@@ -57,7 +58,7 @@ def drawn_by_parts(rows, number, seed):
 )
 def test_other_methods_sample_random_points_of_all_parts(settings, folder, tmp_path, monkeypatch):
     monkeypatch.setattr(chunks, "PART", 120)
-    points = np.random.default_rng(1).normal(size=(500, 3))
+    points = normal_points(500, 1)
     points[100:160] = np.nan
     finite = np.delete(np.arange(500), slice(100, 160))
     drawn = drawn_by_parts(finite, 200, seed=3)
@@ -74,12 +75,12 @@ def test_other_methods_sample_random_points_of_all_parts(settings, folder, tmp_p
     assert "30 of 440 points (60 more without" in out
     kept = np.load(tmp_path / "out.npy")
     expected = np.load(tmp_path / "expected.npy")
-    np.testing.assert_array_equal(kept, expected)
+    assert_array_equal(kept, expected)
 
 
 @pytest.mark.parametrize("chunk", [[], ["--chunk", 60]])
 def test_bounds_hold_for_chunks_and_whole_files(chunk, folder, tmp_path):
-    points = np.random.default_rng(1).normal(size=(500, 3))
+    points = normal_points(500, 1)
     is_inside = (np.abs(points[:, :2]) <= 1).all(1)
     np.save(tmp_path / "all.npy", points)
     np.save(tmp_path / "part.npy", points[is_inside])
@@ -93,7 +94,7 @@ def test_bounds_hold_for_chunks_and_whole_files(chunk, folder, tmp_path):
     assert f"30 of {is_inside.sum()} points, " in out
     kept = np.load(tmp_path / "out.npy")
     expected = np.load(tmp_path / "expected.npy")
-    np.testing.assert_array_equal(kept, expected)
+    assert_array_equal(kept, expected)
 
 
 @pytest.mark.parametrize(
@@ -115,7 +116,7 @@ def test_unsupported_file_says_why(name, content, said, folder, tmp_path):
 
 def test_sampler_with_anchors_takes_whole_files_only(anchored, tmp_path):
     source = tmp_path / "a.npy"
-    points = np.random.default_rng(1).normal(size=(90, 3))
+    points = normal_points(90, 1)
     np.save(source, points)
     settings = ["--weights", anchored, "--readout", "matched", "--m", 20]
 

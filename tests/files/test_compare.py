@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from mops_lightning.data.formats.registry import WRITERS
-from mops_lightning.data.formats.table import Table
 from mops_lightning.files import compare
 from mops_lightning.files.compare import compare_file, ground_error, options_by_method
+from tests.support.cloud_files import write_cloud
+from tests.support.clouds import normal_points
 
 
 def test_coverage_by_hand():
@@ -27,7 +27,7 @@ def test_coverage_by_hand():
 
 
 def test_coverage_of_all_points_is_perfect():
-    points = np.random.default_rng(0).normal(size=(5, 3))
+    points = normal_points(5, 0)
 
     assert compare.coverage(points, points) == (0, 0, 0)
 
@@ -103,8 +103,8 @@ def test_compare_measures_the_ground_of_airborne_scans_only(tmp_path):
     points = np.random.default_rng(0).uniform(0, 9, (400, 3))
     classes = np.repeat([1, 2], 200).astype(np.uint8)
     points[classes == 2, 2] = 1.0
-    WRITERS[".las"](airborne, Table(points, {"classification": classes}))
-    WRITERS[".ply"](other, Table(points))
+    write_cloud(airborne, points, {"classification": classes})
+    write_cloud(other, points)
     methods = options_by_method(60, ["random"], None, None, 0)
 
     of_airborne = compare_file(airborne, 60, methods, 0)
@@ -126,8 +126,8 @@ def test_compare_measures_the_ground_of_airborne_scans_only(tmp_path):
 def test_compare_file_samples_once_before_it_measures_time(tmp_path, monkeypatch):
     """Imports and compilation belong to no method; the first one had them."""
     path = tmp_path / "one.ply"
-    points = np.random.default_rng(0).normal(size=(700, 3))
-    WRITERS[".ply"](path, Table(points))
+    points = normal_points(700, 0)
+    write_cloud(path, points)
     sizes = []
     sample = compare.sample_cloud
 

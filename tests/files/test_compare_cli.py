@@ -11,6 +11,8 @@ from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.zoo import weights
 from mops_lightning.zoo.names import UNTRAINED
 from tests.support.captured import captured, done, refused
+from tests.support.cloud_files import write_cloud
+from tests.support.clouds import normal_points
 
 
 def call(*arguments):
@@ -64,10 +66,10 @@ def distances_of_first_row(text):
 def test_compare_columns_name_those_of_bin_files(folder, tmp_path):
     in_ply = tmp_path / "scan.ply"
     in_bin = tmp_path / "scan.bin"
-    points = np.random.default_rng(0).normal(size=(300, 3)).astype(np.float32)
+    points = normal_points(300, 0).astype(np.float32)
     constant_first = np.insert(points, 0, 7.0, axis=1)
     constant_first.tofile(in_bin)
-    WRITERS[".ply"](in_ply, Table(points.astype(float)))
+    write_cloud(in_ply, points.astype(float))
     options = ["--m", 30, "--methods", "fps"]
     columns = ["--columns", "intensity,x,y,z"]
 

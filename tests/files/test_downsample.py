@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
-from mops_lightning.data.formats.registry import read
+from tests.support.cloud_files import contents
 from tests.support.downsample import call, done, refused
 
 
@@ -27,15 +28,15 @@ def test_untrained_method_keeps_rows_of_the_file(method, folder, tmp_path):
     source, target = folder / "in" / "a.ply", tmp_path / "out.npz"
     out = done(source, target, "--method", *method, "--m", 20)
     assert "20 of 299 points (1 more without finite coordinates left out)" in out
-    kept, whole = read(target, 9, 0), read(source, 9, 0)
+    kept, whole = contents(target), contents(source)
     rows = kept.columns["label"].astype(int)
     assert len(set(rows)) == 20
-    np.testing.assert_array_equal(kept.points, whole.points[rows])
+    assert_array_equal(kept.points, whole.points[rows])
 
 
 def test_matched_and_completed_readouts_keep_rows(folder, tmp_path):
     source = folder / "in" / "a.ply"
-    whole = read(source, 9, 0).points
+    whole = contents(source).points
     found = {}
     for readout in ("generated", "matched", "completed"):
         target = tmp_path / f"{readout}.npy"

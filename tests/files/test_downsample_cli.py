@@ -2,8 +2,8 @@
 
 import pytest
 
-from mops_lightning.data.formats.registry import read
 from mops_lightning.filesystem import TEMPORARY
+from tests.support.cloud_files import contents
 from tests.support.downsample import call, done, refused
 
 FPS = ["--m", 5, "--method", "fps"]
@@ -57,7 +57,7 @@ def test_existing_output_needs_overwrite(folder, tmp_path):
     assert f"{target} exists" in refused(source, target, *settings)
     assert target.read_text() == "mine"
     assert call(source, target, *settings, "--overwrite")[0] == 0
-    assert len(read(target, 9, 0).points) == 5
+    assert len(contents(target).points) == 5
 
 
 def test_folder_removes_what_a_killed_run_left(folder, tmp_path):
@@ -71,11 +71,11 @@ def test_folder_removes_what_a_killed_run_left(folder, tmp_path):
 def test_real_scans_keep_attributes(real_data, tmp_path):
     scans = real_data("scans")
     done(scans, tmp_path, "--method", "random", "--m", 100)
-    fragment = read(tmp_path / "fragment.pcd", 9, 0)
+    fragment = contents(tmp_path / "fragment.pcd")
     assert len(fragment.points) == 100
     assert "normal_x" in fragment.columns
-    assert "nx" in read(tmp_path / "stanford-bunny.ply", 9, 0).columns  # .obj has no room
-    assert len(read(tmp_path / "kitti_000000.bin", 9, 0).columns["intensity"]) == 100
+    assert "nx" in contents(tmp_path / "stanford-bunny.ply").columns  # .obj has no room
+    assert len(contents(tmp_path / "kitti_000000.bin").columns["intensity"]) == 100
 
 
 def test_downsample_of_one_point_says_point(tmp_path):

@@ -8,8 +8,8 @@ import distributed
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 
-from mops_lightning.data.formats.registry import WRITERS, read
 from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import UserError
 from mops_lightning.files.chunks import sample_by_chunks
@@ -17,6 +17,8 @@ from mops_lightning.files.engine import DaskEngine, Engine, dask_engine
 from mops_lightning.files.options import Options
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.zoo import weights
+from tests.support.cloud_files import contents, write_cloud
+from tests.support.clouds import normal_points
 from tests.support.dask import environment_kept
 from tests.support.downsample import call, done, refused
 
@@ -25,10 +27,10 @@ from tests.support.downsample import call, done, refused
 def scan(tmp_path_factory):
     """A cloud with a hole in its numbers, and a sampler."""
     folder = tmp_path_factory.mktemp("scan")
-    points = np.random.default_rng(0).normal(size=(3000, 3)) * [5, 1, 1] + [1000, 0, 0]
+    points = normal_points(3000, 0) * [5, 1, 1] + [1000, 0, 0]
     points[200:420] = np.nan
     points[700] = points[1900]  # equally near ones in different chunks
-    WRITERS[".ply"](folder / "scan.ply", Table(points, {"label": np.arange(3000)}))
+    write_cloud(folder / "scan.ply", points, {"label": np.arange(3000)})
     torch.manual_seed(0)
     node = {"_target_": "mops_lightning.samplers.mops.MOPSNet", "m": 24}
     sampler = MOPSNet(24).eval()
@@ -41,10 +43,10 @@ def options(readout, size=300):
 
 
 def same(one: Table, other: Table) -> None:
-    np.testing.assert_array_equal(one.points, other.points)
+    assert_array_equal(one.points, other.points)
     assert list(one.columns) == list(other.columns)
     for name, column in one.columns.items():
-        np.testing.assert_array_equal(column, other.columns[name])
+        assert_array_equal(column, other.columns[name])
 
 
 class Watched(Engine):
@@ -83,10 +85,10 @@ def test_running_scheduler_equals_one_process(readout, client, scan, tmp_path):
     settings += ["--cluster", client.scheduler.address]
     out = done(scan[0], tmp_path / "two.npz", *settings)
     assert "24 of 2,780 points (220 more without finite coordinates left out)" in out
-    one, two = (read(tmp_path / f"{name}.npz", 9, 0) for name in ("one", "two"))
+    one, two = (contents(tmp_path / f"{name}.npz") for name in ("one", "two"))
     # Threads differ between the two, and with them the order of sums.
-    np.testing.assert_allclose(two.points, one.points, atol=1e-5 * np.ptp(one.points))
-    np.testing.assert_array_equal(two.columns.get("label"), one.columns.get("label"))
+    assert_allclose(two.points, one.points, atol=1e-5 * np.ptp(one.points))
+    assert_array_equal(two.columns.get("label"), one.columns.get("label"))
 
 
 def test_broken_file_is_named(client, scan, tmp_path):
@@ -157,4 +159,4 @@ def test_spacing_and_voxels_by_workers_equal_one_pass(budget, client, scan, tmp_
     address = client.scheduler.address
     done(scan[0], tmp_path / "parts.npz", *budget, "--chunk", 500, "--cluster", address)
 
-    same(read(tmp_path / "parts.npz", 9, 0), read(tmp_path / "whole.npz", 9, 0))
+    same(contents(tmp_path / "parts.npz"), contents(tmp_path / "whole.npz"))

@@ -3,6 +3,7 @@
 import laspy
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from mops_lightning.files.cli import propagate
 from tests.support import captured
@@ -35,14 +36,14 @@ def check_copy(source, copy, number):
     assert len(after.points) == number
     kept = after.points.array
     assert kept.dtype == before.points.array.dtype
-    np.testing.assert_array_equal(kept, before.points.array[rows])
+    assert_array_equal(kept, before.points.array[rows])
     assert header_fields(copy) == header_fields(source)
     header = after.header
-    np.testing.assert_array_equal(header.mins, after.xyz.min(0))
-    np.testing.assert_array_equal(header.maxs, after.xyz.max(0))
+    assert_array_equal(header.mins, after.xyz.min(0))
+    assert_array_equal(header.maxs, after.xyz.max(0))
     returns = np.bincount(after.return_number, minlength=16)[1:]
     most = 15 if header.version.minor >= 4 else 5
-    np.testing.assert_array_equal(header.number_of_points_by_return[:most], returns[:most])
+    assert_array_equal(header.number_of_points_by_return[:most], returns[:most])
 
 
 @pytest.mark.parametrize("path", PATHS)
@@ -87,11 +88,11 @@ def test_propagate_sets_an_element_of_an_array_and_adds_a_dimension(tmp_path):
     again = laspy.read(out)
     colours = again["Colors"]
     old_colours = cloud["Colors"]
-    np.testing.assert_array_equal(again["label"], label)
-    np.testing.assert_array_equal(colours[:, 0], old_colours[:, 0])
-    np.testing.assert_array_equal(colours[:, 1], colour)
-    np.testing.assert_array_equal(colours[:, 2], old_colours[:, 2])
-    np.testing.assert_array_equal(again["long steps"].array, cloud["long steps"].array)
+    assert_array_equal(again["label"], label)
+    assert_array_equal(colours[:, 0], old_colours[:, 0])
+    assert_array_equal(colours[:, 1], colour)
+    assert_array_equal(colours[:, 2], old_colours[:, 2])
+    assert_array_equal(again["long steps"].array, cloud["long steps"].array)
 
 
 @pytest.mark.parametrize("form", WAVEFORM_FORMATS)

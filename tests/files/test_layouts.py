@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 import trimesh
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mops_lightning.data.formats.registry import read
 from mops_lightning.files.cli import propagate
 from tests.support.captured import done
+from tests.support.cloud_files import contents
 from tests.support.downsample import call, refused
 
 SIX_COLUMNS = ["--columns", "x,y,z,r,g,b"]
@@ -60,8 +62,8 @@ def test_propagate_columns_names_those_of_a_bin_file(six_columns, tmp_path):
 
     done(propagate, [small, path, "--field", "label", *SIX_COLUMNS])
 
-    made = read(tmp_path / "a_propagated.ply", 9, 0)
-    np.testing.assert_array_equal(made.columns["b"], rows[:, 5])
+    made = contents(tmp_path / "a_propagated.ply")
+    assert_array_equal(made.columns["b"], rows[:, 5])
     assert made.columns["label"].tolist() == [7] * 60
 
 
@@ -83,7 +85,7 @@ def test_downsample_vertices_takes_those_of_a_mesh(suffix, tmp_path):
     vertices = read(path, 9, 0, vertices=True).points
     assert len(kept) == 50
     assert as_set(kept) <= as_set(vertices)
-    np.testing.assert_allclose(vertices, ball.vertices, atol=1e-6)
+    assert_allclose(vertices, ball.vertices, atol=1e-6)
 
 
 def test_downsample_vertices_of_a_sampled_surface_is_refused(tmp_path):

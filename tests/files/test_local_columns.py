@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mops_lightning import load
-from mops_lightning.data.formats.registry import read
+from tests.support.cloud_files import contents
+from tests.support.clouds import normal_points
 from tests.support.downsample import done
 
 
@@ -12,7 +14,7 @@ from tests.support.downsample import done
 def scan(tmp_path):
     """A cloud of 3,000 points in map coordinates."""
     path = tmp_path / "scan.npy"
-    unit = np.random.default_rng(1).normal(size=(3000, 3))
+    unit = normal_points(3000, 1)
     points = unit * [50, 20, 3] + np.array([4e5, 5e6, 80])
     np.save(path, points)
     return path
@@ -25,7 +27,7 @@ def test_local_columns_of_a_file_equal_those_of_the_cloud(readout, local, scan, 
     done(scan, out, "--weights", local, "--readout", readout, "--m", 30)
 
     expected, _ = load(str(local)).downsample(np.load(scan), 30, readout)
-    np.testing.assert_allclose(np.load(out), expected, rtol=0, atol=1e-4)
+    assert_allclose(np.load(out), expected, rtol=0, atol=1e-4)
 
 
 def test_local_columns_of_a_chunk_with_all_points_equal_those_of_the_file(local, scan, tmp_path):
@@ -34,7 +36,7 @@ def test_local_columns_of_a_chunk_with_all_points_equal_those_of_the_file(local,
 
     done(scan, tmp_path / "chunk.npy", *settings, "--chunk", 3000)
 
-    np.testing.assert_array_equal(np.load(tmp_path / "chunk.npy"), np.load(tmp_path / "whole.npy"))
+    assert_array_equal(np.load(tmp_path / "chunk.npy"), np.load(tmp_path / "whole.npy"))
 
 
 def as_set(points):
@@ -74,7 +76,7 @@ def test_local_columns_in_chunks_equal_those_of_the_whole_file(
 
     assert "30 of 3,000 points" in line
     assert "random" not in line
-    np.testing.assert_allclose(np.load(chunks), np.load(whole), rtol=0, atol=tolerance)
+    assert_allclose(np.load(chunks), np.load(whole), rtol=0, atol=tolerance)
 
 
 def test_completed_points_of_local_columns_come_from_a_chunk_of_random_points(
@@ -84,4 +86,4 @@ def test_completed_points_of_local_columns_come_from_a_chunk_of_random_points(
 
     assert "random (--chunk)" in done(scan, tmp_path / "out.npy", *settings)
 
-    assert len(read(tmp_path / "out.npy", 9, 0).points) == 30
+    assert len(contents(tmp_path / "out.npy").points) == 30

@@ -2,14 +2,15 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from mops_lightning.data.features import STORED_NORMALS
-from mops_lightning.data.formats.registry import WRITERS, read
-from mops_lightning.data.formats.table import Table
+from mops_lightning.data.formats.registry import read
 from mops_lightning.files.column_means import renormalise
 from mops_lightning.files.compare import compare_file, options_by_method
 from mops_lightning.files.downsample import downsample_file
 from mops_lightning.files.options import Options
+from tests.support.cloud_files import write_cloud
 
 UP = {"nx": 0.0, "ny": 0.0, "nz": 1.0}
 
@@ -22,7 +23,7 @@ def sampled(tmp_path, columns):
     points[:, :2] = np.random.default_rng(0).uniform(-1, 1, (200, 2))
     filled = {name: np.full(200, value, np.float32) for name, value in UP.items()}
     filled.update(columns)
-    WRITERS[".ply"](source, Table(points, filled))
+    write_cloud(source, points, filled)
     options = Options(6, method="normal_space", coordinates_only=False)
     downsample_file(source, target, options)
     return read(target, 1, 0)
@@ -44,7 +45,7 @@ def test_compare_measures_the_points_that_downsample_keeps(tmp_path):
     across[[3, 50, 150]] = 1.0
     up = (across == 0).astype(np.float32)
     columns = {"nx": across, "ny": np.zeros(200, np.float32), "nz": up}
-    WRITERS[".ply"](tmp_path / "in.ply", Table(points, columns))
+    write_cloud(tmp_path / "in.ply", points, columns)
 
     methods = options_by_method(6, ["normal_space"], None, None, 0)
     compared = compare_file(tmp_path / "in.ply", 6, methods, 0)
@@ -52,7 +53,7 @@ def test_compare_measures_the_points_that_downsample_keeps(tmp_path):
     rows = compared.results[0].rows
     assert set(rows.tolist()) > {3, 50, 150}
     kept = sampled(tmp_path, columns)
-    np.testing.assert_array_equal(kept.points, points[rows])
+    assert_array_equal(kept.points, points[rows])
 
 
 @pytest.mark.parametrize("wrong", [0.0, np.nan])
@@ -80,6 +81,6 @@ def test_means_of_normals_have_length_1_under_every_name(names):
 
     renormalise(columns)
 
-    np.testing.assert_array_equal(columns[x], np.array([0.0, 0.0], np.float32))
-    np.testing.assert_array_equal(columns[y], np.array([0.6, 0.0], np.float32))
-    np.testing.assert_array_equal(columns[z], np.array([0.8, 0.0], np.float32))
+    assert_array_equal(columns[x], np.array([0.0, 0.0], np.float32))
+    assert_array_equal(columns[y], np.array([0.6, 0.0], np.float32))
+    assert_array_equal(columns[z], np.array([0.8, 0.0], np.float32))

@@ -4,28 +4,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial import cKDTree
 
 import mops_lightning
-from mops_lightning.data.formats.registry import WRITERS, read
-from mops_lightning.data.formats.table import Table
 from mops_lightning.files import propagate as module
 from mops_lightning.files.cli import propagate as main
 from mops_lightning.ops import propagation
-from tests.support.captured import captured, done
-from tests.support.clouds import line_of
+from tests.support.captured import done
+from tests.support.cloud_files import contents, write_cloud
+from tests.support.clouds import line_of, normal_points, uniform_points
 from tests.support.downsample import call as downsample
 from tests.support.downsample import refused as not_downsampled
 
 FIELD = ["--field", "label"]
-
-
-def call(*arguments):
-    return captured(main, arguments)
-
-
-def contents(path):
-    return read(path, 9, 0)
 
 
 @pytest.fixture(autouse=True)
@@ -36,19 +28,27 @@ def small_parts(monkeypatch):
 @pytest.fixture
 def scan(tmp_path):
     """500 points far from the origin, of which 20 are not finite, in a file."""
-    points = np.random.default_rng(1).normal([400_000, 5_000_000, 0], 1, (500, 3))
+    points = normal_points(500, 1)
+    points += [400_000, 5_000_000, 0]
     points[100:120] = np.nan
     columns = {"intensity": np.arange(500, dtype=np.uint16)}
-    WRITERS[".ply"](tmp_path / "big.ply", Table(points, columns))
+    write_cloud(tmp_path / "big.ply", points, columns)
     return tmp_path / "big.ply"
 
 
 def distances_between(points, sampled):
-    return np.linalg.norm(points[:, None] - sampled, axis=2)
+    differences = points[:, None] - sampled
+    return np.linalg.norm(differences, axis=2)
 
 
 def nearest(points, sampled):
-    return distances_between(points, sampled).argmin(1)
+    distances = distances_between(points, sampled)
+    return distances.argmin(1)
+
+
+def write_labelled(path, points):
+    """Write points whose labels are their rows."""
+    write_cloud(path, points, {"label": np.arange(len(points))})
 
 
 def write_scan(path, points, **columns):
@@ -68,8 +68,9 @@ def write_scan(path, points, **columns):
 def test_map_leads_from_sample_to_all_points(scan, tmp_path):
     map_ = tmp_path / "map.npz"
     small = tmp_path / "small.ply"
+    settings = ["--m", 30, "--method", "fps", "--map", map_]
 
-    status, _, err = downsample(scan, small, "--m", 30, "--method", "fps", "--map", map_)
+    status, _, err = downsample(scan, small, *settings)
 
     assert status == 0
     assert err == ""
@@ -80,8 +81,8 @@ def test_map_leads_from_sample_to_all_points(scan, tmp_path):
     is_finite = np.isfinite(points).all(1)
     nearest_rows = nearest(points[is_finite], sample.points)
     assert len(carried) == 500
-    np.testing.assert_array_equal(carried[~is_finite], -1)
-    np.testing.assert_array_equal(carried[is_finite], labels[nearest_rows])
+    assert_array_equal(carried[~is_finite], -1)
+    assert_array_equal(carried[is_finite], labels[nearest_rows])
     rows = np.load(map_)["rows"]
     rows_of_sample = rows[sample.columns["intensity"], 0]
     assert (rows_of_sample >= 0).all()
@@ -91,26 +92,30 @@ def test_map_with_several_rows_averages_scores(scan, tmp_path):
     map_ = tmp_path / "new" / "map.npz"
     small = tmp_path / "small.npz"
     scores = np.random.default_rng(2).random(30)
+    settings = ["--m", 30, "--method", "random", "--map", map_, "--map-k", 4]
 
-    status, _, _ = downsample(
-        scan, small, "--m", 30, "--method", "random", "--map", map_, "--map-k", 4
-    )
+    status, _, _ = downsample(scan, small, *settings)
 
     assert status == 0
     points = contents(scan).finite().points
-    distances = distances_between(points, contents(small).points)
-    rows = distances.argsort(1)[:, :4]
+    sample = contents(small).points
+    distances = distances_between(points, sample)
+    order = distances.argsort(1)
+    rows = order[:, :4]
     near = np.take_along_axis(distances, rows, 1)
     inverse = np.maximum(near, 1e-12) ** -2
     weights = inverse / inverse.sum(1, keepdims=True)
-    expected = (scores[rows] * weights).sum(1)
+    shares = scores[rows] * weights
+    expected = shares.sum(1)
     carried = mops_lightning.propagate(scores, map_, fill=np.nan)
     is_finite = np.isfinite(carried)
-    np.testing.assert_allclose(carried[is_finite], expected, rtol=1e-5)
+    assert_allclose(carried[is_finite], expected, rtol=1e-5)
 
 
 def test_map_of_a_folder_gets_one_line(scan, tmp_path):
-    said = not_downsampled(tmp_path, "out", "--m", 8, "--method", "fps", "--map", "map.npz")
+    settings = ["--m", 8, "--method", "fps", "--map", "map.npz"]
+
+    said = not_downsampled(tmp_path, "out", *settings)
 
     assert "--map is the map of one file" in said
 
@@ -130,8 +135,9 @@ def test_map_of_a_folder_gets_one_line(scan, tmp_path):
 def test_wrong_map_of_downsample_gets_one_line(arguments, said, scan, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "old.npz").touch()
+    settings = ["--m", 8, "--method", "fps", *arguments]
 
-    line = not_downsampled("big.ply", "small.npz", "--m", 8, "--method", "fps", *arguments)
+    line = not_downsampled("big.ply", "small.npz", *settings)
 
     assert said in line
 
@@ -140,48 +146,55 @@ def test_wrong_map_of_downsample_gets_one_line(arguments, said, scan, tmp_path, 
 @pytest.mark.parametrize("target", [".ply", ".las", ".laz"])
 def test_labels_reach_all_points(source, target, tmp_path):
     random = np.random.default_rng(1)
-    points = random.normal(size=(200, 3)).astype(np.float32).astype(float)
+    in_float32 = random.normal(size=(200, 3)).astype(np.float32)
+    points = in_float32.astype(float)
     intensity = np.arange(200, dtype=np.uint16)
     labels = np.arange(20) + 2**30
     classes = np.full(20, 3, np.uint8)
     classes[10:] = 200  # a LAS class of old files is below 32
     scores = random.random(20)
-    columns: dict[str, Any] = {"label": labels, "classification": classes, "score": scores}
+    columns: dict[str, Any] = {
+        "label": labels,
+        "classification": classes,
+        "score": scores,
+    }
     big = tmp_path / f"big{source}"
     small = tmp_path / "small.npz"
     out = tmp_path / f"out{target}"
-    WRITERS[source](big, Table(points, {"intensity": intensity}))
-    WRITERS[".npz"](small, Table(points[:20], columns))
+    write_cloud(big, points, {"intensity": intensity})
+    write_cloud(small, points[:20], columns)
     fields = ["--field", "label", "--field", "classification", "--field", "score"]
 
     said = done(main, [small, big, out, *fields])
 
     assert "label, classification, score of 200 points" in said
     made = contents(out)
-    rows = nearest(contents(big).points, points[:20])
-    np.testing.assert_allclose(made.points, points, atol=1e-6)
-    np.testing.assert_array_equal(made.columns["label"], labels[rows])
-    np.testing.assert_array_equal(made.columns["score"], scores[rows])
+    given = contents(big)
+    rows = nearest(given.points, points[:20])
+    assert_allclose(made.points, points, atol=1e-6)
+    assert_array_equal(made.columns["label"], labels[rows])
+    assert_array_equal(made.columns["score"], scores[rows])
     # LAS keeps numbers that its own column cannot hold in a column beside it.
     name = "classification_" if "classification_" in made.columns else "classification"
-    np.testing.assert_array_equal(made.columns[name], classes[rows])
+    assert_array_equal(made.columns[name], classes[rows])
     if source != ".npy":  # a plain array has no names of columns
-        np.testing.assert_array_equal(made.columns["intensity"], intensity)
+        assert_array_equal(made.columns["intensity"], intensity)
 
 
 def test_points_without_coordinates_are_left_out_and_columns_kept(scan, tmp_path):
     small = tmp_path / "small.ply"
-    sample = contents(scan).take(np.arange(0, 90, 3))
-    WRITERS[".ply"](small, Table(sample.points, {"label": np.arange(30)}))
+    every_third = np.arange(0, 90, 3)
+    sample = contents(scan).take(every_third)
+    write_cloud(small, sample.points, {"label": np.arange(30)})
 
     done(main, [small, scan, *FIELD])
 
     made = contents(tmp_path / "big_propagated.ply")
     whole = contents(scan).finite()
     rows = nearest(whole.points, sample.points)
-    np.testing.assert_array_equal(made.points, whole.points)
-    np.testing.assert_array_equal(made.columns["intensity"], whole.columns["intensity"])
-    np.testing.assert_array_equal(made.columns["label"], rows)
+    assert_array_equal(made.points, whole.points)
+    assert_array_equal(made.columns["intensity"], whole.columns["intensity"])
+    assert_array_equal(made.columns["label"], rows)
 
 
 def test_parts_share_one_tree_of_the_sample(scan, tmp_path, monkeypatch):
@@ -193,44 +206,49 @@ def test_parts_share_one_tree_of_the_sample(scan, tmp_path, monkeypatch):
 
     monkeypatch.setattr(propagation, "cKDTree", counted)
     small = tmp_path / "small.ply"
-    sample = contents(scan).take(np.arange(0, 90, 3))
+    every_third = np.arange(0, 90, 3)
+    sample = contents(scan).take(every_third)
     scores = np.random.default_rng(1).random(30)
-    WRITERS[".ply"](small, Table(sample.points, {"score": scores}))
+    write_cloud(small, sample.points, {"score": scores})
 
-    status, _, _ = call(small, scan, "--field", "score", "--k", 3)
+    done(main, [small, scan, "--field", "score", "--k", 3])
 
-    assert status == 0
     assert len(built) == 1
     points = contents(scan).finite().points
     whole = propagation.propagation_map(points, sample.points, 3)
     expected = mops_lightning.propagate(scores, whole)
-    made = contents(tmp_path / "big_propagated.ply").columns["score"]
-    np.testing.assert_allclose(made, expected, atol=1e-12)
+    made = contents(tmp_path / "big_propagated.ply")
+    assert_allclose(made.columns["score"], expected, atol=1e-12)
 
 
-@pytest.mark.parametrize(("target", "name"), [(".ply", "intensity"), (".las", "intensity_")])
+@pytest.mark.parametrize(
+    ("target", "name"),
+    [
+        (".ply", "intensity"),
+        (".las", "intensity_"),
+    ],
+)
 def test_later_parts_may_have_larger_and_broken_numbers(target, name, tmp_path):
-    points = np.random.default_rng(1).random((180, 3))
+    points = uniform_points(180, 1)
     large = np.arange(180) + 2**31 - 70  # int32 holds those of the first part
     intensity = np.full(180, 3.0)
     intensity[101:] = 0.5
-    sample = Table(points[:5], {"label": np.arange(5)})
     small = tmp_path / "small.npz"
     big = tmp_path / "big.npy"
     out = tmp_path / f"out{target}"
     write_scan(big, points, large=large, intensity=intensity)
-    WRITERS[".npz"](small, sample)
+    write_labelled(small, points[:5])
 
     done(main, [small, big, out, *FIELD])
 
     made = contents(out).columns
-    np.testing.assert_array_equal(made["large"], large)
-    np.testing.assert_array_equal(made[name], intensity)
+    assert_array_equal(made["large"], large)
+    assert_array_equal(made[name], intensity)
 
 
 def test_fraction_between_the_smallest_and_the_largest_number_is_kept(tmp_path):
     """LAS has whole intensities, which hold the smallest and the largest number here."""
-    points = np.random.default_rng(1).random((180, 3))
+    points = uniform_points(180, 1)
     intensity = np.zeros(180)
     intensity[70] = 0.5
     intensity[100] = 3
@@ -238,26 +256,28 @@ def test_fraction_between_the_smallest_and_the_largest_number_is_kept(tmp_path):
     big = tmp_path / "big.npy"
     out = tmp_path / "out.las"
     write_scan(big, points, intensity=intensity)
-    WRITERS[".npz"](small, Table(points[:5], {"label": np.arange(5)}))
+    write_labelled(small, points[:5])
 
     done(main, [small, big, out, *FIELD])
 
-    np.testing.assert_array_equal(contents(out).columns["intensity_"], intensity)
+    made = contents(out).columns
+    assert_array_equal(made["intensity_"], intensity)
 
 
 def test_first_part_far_from_the_last_one_keeps_its_place(tmp_path):
     """The whole-number steps of LAS must reach from one to the other."""
-    points = np.random.default_rng(1).random((120, 3))
+    points = uniform_points(120, 1)
     points[:60] += [3_000_000, 5_000_000, 0]
     small = tmp_path / "small.npz"
     big = tmp_path / "big.npy"
     out = tmp_path / "out.las"
     np.save(big, points)
-    WRITERS[".npz"](small, Table(points[:3], {"label": np.arange(3)}))
+    write_labelled(small, points[:3])
 
     done(main, [small, big, out, *FIELD])
 
-    np.testing.assert_allclose(contents(out).points, points, atol=0.01)
+    made = contents(out)
+    assert_allclose(made.points, points, atol=0.01)
 
 
 @pytest.fixture
@@ -268,33 +288,44 @@ def line_files(tmp_path):
     line = line_of(5)
     label = np.array([5, 9, 9])
     red = np.array([0, 100, 100], np.uint8)
-    WRITERS[".npz"](big, Table(line, {}))
-    WRITERS[".npz"](small, Table(line[[0, 2, 4]], {"label": label, "red": red}))
+    columns: dict[str, Any] = {"label": label, "red": red}
+    write_cloud(big, line)
+    write_cloud(small, line[[0, 2, 4]], columns)
     return [small, big]
 
 
 def test_labels_of_several_sampled_points_vote(line_files, tmp_path):
-    done(main, [*line_files, tmp_path / "out.ply", *FIELD, "--k", 3])
+    out = tmp_path / "out.ply"
 
-    assert contents(tmp_path / "out.ply").columns["label"].tolist() == [5, 9, 9, 9, 9]
+    done(main, [*line_files, out, *FIELD, "--k", 3])
+
+    label = contents(out).columns["label"]
+    assert label.tolist() == [5, 9, 9, 9, 9]
 
 
 def test_colours_are_averaged_on_request(line_files, tmp_path):
-    done(main, [*line_files, tmp_path / "out.ply", "--field", "red", "--k", 2, "--mean"])
+    out = tmp_path / "out.ply"
 
-    assert contents(tmp_path / "out.ply").columns["red"].tolist() == [0, 50, 100, 100, 100]
+    done(main, [*line_files, out, "--field", "red", "--k", 2, "--mean"])
+
+    red = contents(out).columns["red"]
+    assert red.tolist() == [0, 50, 100, 100, 100]
 
 
 @pytest.mark.parametrize("kind", ["f4", "u4"])
 def test_packed_colours_are_averaged_channel_by_channel(kind, tmp_path):
     line = line_of(3)
-    bytes_of_colours = np.array([[0, 0, 200, 0], [100, 2, 0, 0]], np.uint8)  # blue, green, red
+    blue_green_red = [
+        [0, 0, 200, 0],
+        [100, 2, 0, 0],
+    ]
+    bytes_of_colours = np.array(blue_green_red, np.uint8)
     packed = bytes_of_colours.view(f"<{kind}")[:, 0]
     small = tmp_path / "small.pcd"
     big = tmp_path / "big.npz"
     out = tmp_path / "out.ply"
-    WRITERS[".npz"](big, Table(line, {}))
-    WRITERS[".pcd"](small, Table(line[[0, 2]], {"rgb": packed}))
+    write_cloud(big, line)
+    write_cloud(small, line[[0, 2]], {"rgb": packed})
 
     done(main, [small, big, out, "--field", "rgb", "--k", 2, "--mean"])
 
@@ -313,8 +344,8 @@ def test_packed_colours_of_whole_numbers_are_carried_unmixed_without_mean(tmp_pa
     small = tmp_path / "small.pcd"
     big = tmp_path / "big.npz"
     out = tmp_path / "out.ply"
-    WRITERS[".npz"](big, Table(line, {}))
-    WRITERS[".pcd"](small, Table(line[[0, 2]], {"rgb": packed}))
+    write_cloud(big, line)
+    write_cloud(small, line[[0, 2]], {"rgb": packed})
 
     done(main, [small, big, out, "--field", "rgb", "--k", 2])
 
@@ -327,11 +358,11 @@ def test_packed_colours_of_whole_numbers_are_carried_unmixed_without_mean(tmp_pa
 def test_double_coordinates_near_the_origin_keep_every_bit(tmp_path):
     small = tmp_path / "small.npz"
     big = tmp_path / "big.npy"
-    points = np.random.default_rng(1).random((50, 3))
+    points = uniform_points(50, 1)
     np.save(big, points)
-    WRITERS[".npz"](small, Table(points[:3], {"label": np.arange(3)}))
+    write_labelled(small, points[:3])
 
-    done(main, [small, big, "--field", "label"])
+    done(main, [small, big, *FIELD])
 
     made = contents(tmp_path / "big_propagated.ply")
-    np.testing.assert_array_equal(made.points, points)
+    assert_array_equal(made.points, points)

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from mops_lightning.data.formats.registry import WRITERS
-from mops_lightning.data.formats.table import Table
 from mops_lightning.files.cli import propagate as main
 from tests.support.captured import refused
+from tests.support.cloud_files import write_cloud
 from tests.support.clouds import line_of
 
 FIELD = ["--field", "label"]
@@ -18,9 +17,9 @@ def folder_of_mistakes(tmp_path, monkeypatch):
     """A folder with clouds, meshes and an old result, which is the current one."""
     monkeypatch.chdir(tmp_path)
     line = line_of(5)
-    WRITERS[".npz"](tmp_path / "big.npz", Table(line, {}))
-    WRITERS[".npz"](tmp_path / "small.npz", Table(line[:3], {"label": np.arange(3)}))
-    WRITERS[".npz"](tmp_path / "empty.npz", Table(line[:0], {}))
+    write_cloud(tmp_path / "big.npz", line)
+    write_cloud(tmp_path / "small.npz", line[:3], {"label": np.arange(3)})
+    write_cloud(tmp_path / "empty.npz", line[:0])
     (tmp_path / "old.ply").touch()
     trimesh.creation.box().export(tmp_path / "mesh.ply")
     trimesh.creation.box().export(tmp_path / "mesh.off")

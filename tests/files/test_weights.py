@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mops_lightning.data.formats.registry import read
 from mops_lightning.data.formats.table import Table
 from mops_lightning.files.column_weights import weights_of
+from tests.support.cloud_files import contents
+from tests.support.clouds import normal_points
 from tests.support.downsample import call, done
 
 SPLAT = [
@@ -69,7 +70,7 @@ def test_splat_keeps_transparent_points_where_there_is_room(splat, tmp_path):
 
     done(path, tmp_path / "small.ply", "--method", "fps", "--m", 350, "--weight", "opacity")
 
-    kept = read(tmp_path / "small.ply", 9, 0).columns["opacity"]
+    kept = contents(tmp_path / "small.ply").columns["opacity"]
     assert np.unique(kept, return_counts=True)[1].tolist() == [150, 200]
 
 
@@ -77,7 +78,7 @@ def test_splat_keeps_transparent_points_where_there_is_room(splat, tmp_path):
 def test_weight_of_a_splat_is_its_opacity(logit, splat):
     path, _ = splat
     logits = np.full(400, logit, np.float32)
-    table = read(path, 9, 0).with_columns({"opacity": logits})
+    table = contents(path).with_columns({"opacity": logits})
 
     weight = weights_of(table, "opacity", path)
 
@@ -98,14 +99,14 @@ def test_completed_set_is_filled_up_by_weight(folder, tmp_path):
     source = tmp_path / "a.npz"
     out = tmp_path / "b.npz"
     # Without the weights, all matches would be the points near the origin.
-    points = np.random.default_rng(0).normal(size=(300, 3))
+    points = normal_points(300, 0)
     points[::2] *= 0.01
     np.savez(source, points=points, score=np.arange(300) % 2)
 
     status, _, _ = call(source, out, "--weights", folder, "--m", 40, "--weight", "score")
 
     assert status == 0
-    score = read(out, 9, 0).columns["score"]
+    score = contents(out).columns["score"]
     assert score.tolist() == [1] * 40
 
 
@@ -117,7 +118,7 @@ def test_weight_acts_among_the_points_of_a_chunk(splat, tmp_path):
     status, _, _ = call(path, out, *settings)
 
     assert status == 0
-    table = read(out, 9, 0)
+    table = contents(out)
     assert len(table.points) == 90
     is_opaque = table.columns["opacity"] > 0
     assert is_opaque.mean() > 0.9
@@ -157,7 +158,7 @@ def test_weight_of_a_chunk_is_no_column_of_coordinates_alone(splat, tmp_path):
     status, _, _ = call(path, out, *settings, "--coordinates-only")
 
     assert status == 0
-    assert not read(out, 9, 0).columns
+    assert not contents(out).columns
 
 
 @pytest.fixture

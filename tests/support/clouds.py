@@ -38,3 +38,15 @@ def line_of(number: int) -> NDArray[np.float64]:
     line = np.zeros((number, 3))
     line[:, 0] = np.arange(number)
     return line
+
+
+def normal_points(number: int, seed: int) -> NDArray[np.float64]:
+    """Return normally distributed points ``(N, 3)``."""
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(number, 3))
+
+
+def uniform_points(number: int, seed: int) -> NDArray[np.float64]:
+    """Return points ``(N, 3)`` spread evenly over the unit cube."""
+    rng = np.random.default_rng(seed)
+    return rng.random((number, 3))

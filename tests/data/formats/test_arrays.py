@@ -6,8 +6,9 @@ import laspy
 import numpy as np
 import pytest
 
-from mops_lightning.data.formats.registry import WRITERS, open_cloud_file, read
+from mops_lightning.data.formats.registry import open_cloud_file
 from mops_lightning.errors import UserError
+from tests.support.cloud_files import contents, write_table
 
 
 @pytest.mark.parametrize("chunked", [True, False])
@@ -16,7 +17,7 @@ def test_npy_fields_of_wrong_shape_are_rejected(shape, chunked, tmp_path):
     path = tmp_path / "a.npy"
     np.save(path, np.zeros(shape, [("x", "f4"), ("y", "f4"), ("z", "f4")]))
     with pytest.raises(UserError, match="one row of fields"):
-        open_cloud_file(path) if chunked else read(path, 9, 0)
+        open_cloud_file(path) if chunked else contents(path)
 
 
 @pytest.mark.parametrize("chunked", [True, False])
@@ -24,7 +25,7 @@ def test_npy_complex_coordinates_are_rejected(chunked, tmp_path):
     path = tmp_path / "a.npy"
     np.save(path, np.zeros(20, [("x", "f4"), ("y", "c8"), ("z", "f4")]))
     with pytest.raises(UserError, match="y must be numbers, got complex64"):
-        open_cloud_file(path).read(range(9)) if chunked else read(path, 9, 0)
+        open_cloud_file(path).read(range(9)) if chunked else contents(path)
 
 
 def test_npy_fortran_order_is_rejected_in_chunks(tmp_path):
@@ -50,8 +51,8 @@ def test_npz_arrays_become_dimensions_of_las_and_arrays_again(kind, tmp_path):
     points = np.arange(60.0).reshape(20, 3)
     np.savez(source, points=points, **named_alike, scores=scores)
 
-    WRITERS[f".{kind}"](path, read(source, 9, 0))
-    WRITERS[".npz"](target, read(path, 9, 0))
+    write_table(path, contents(source))
+    write_table(target, contents(path))
 
     las = laspy.read(path)
     back = np.load(target)
@@ -75,7 +76,7 @@ def test_classes_of_npz_decide_the_version_of_las(largest, version, tmp_path):
     classes = np.array([1, 2, largest], np.uint8)
     np.savez(source, points=np.eye(3), classification=classes)
 
-    WRITERS[".las"](target, read(source, 9, 0))
+    write_table(target, contents(source))
 
     las = laspy.read(target)
     assert str(las.header.version) == version

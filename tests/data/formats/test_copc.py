@@ -6,6 +6,7 @@ import copclib
 import laspy
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mops_lightning.data.formats.area import Area
 from mops_lightning.data.formats.las import octree
@@ -51,7 +52,7 @@ def test_copc_keeps_all_bytes_of_points_and_header(form, small_cells, tmp_path):
     write(out, read(source, 1, 0))
 
     written = all_points(out).array
-    np.testing.assert_array_equal(in_order(written), in_order(cloud.points.array))
+    assert_array_equal(in_order(written), in_order(cloud.points.array))
     header, info, pages = joined_header(out)
     assert header == header_fields(source)
     info_user, info_id, _, info_data = info
@@ -203,9 +204,9 @@ def test_older_formats_keep_their_dimensions_in_copc(form, tmp_path):
     for name in cloud.point_format.dimension_names:
         if name != "scan_angle_rank":
             values = np.asarray(found[name])
-            np.testing.assert_array_equal(values, np.asarray(cloud[name]), name)
+            assert_array_equal(values, np.asarray(cloud[name]), name)
     angles = np.asarray(found.scan_angle) * 0.006
-    np.testing.assert_allclose(angles, cloud.scan_angle_rank, atol=0.003)
+    assert_allclose(angles, cloud.scan_angle_rank, atol=0.003)
     names = [extra.name for extra in found.point_format.extra_dimensions]
     assert names == [extra.name for extra in EXTRA]
 
@@ -274,5 +275,5 @@ def test_real_files_become_copc_with_all_points(real_data, tmp_path):
         found = in_order(all_points(out).array, order)
         for dimension in cloud.point_format.standard_dimension_names:
             if dimension in found.dtype.names:
-                np.testing.assert_array_equal(found[dimension], expected[dimension])
+                assert_array_equal(found[dimension], expected[dimension])
         assert copclib.FileReader(str(out)).ValidateSpatialBounds()

@@ -5,9 +5,10 @@ import sys
 import numpy as np
 import pye57
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
-from mops_lightning.data.formats.registry import read
 from mops_lightning.errors import UserError
+from tests.support.cloud_files import contents
 from tests.support.downsample import call, refused
 
 QUARTER_TURN = np.array([np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
@@ -44,17 +45,17 @@ def test_read_e57_joins_scans_at_their_poses(tmp_path):
         file.write_scan_raw(first, translation=first_shift)
         file.write_scan_raw(second, rotation=QUARTER_TURN, translation=second_shift)
 
-    table = read(path, 9, 0)
+    table = contents(path)
 
     x, y, z = points_of(second).T
     turned = np.column_stack([-y, x, z])
     expected = np.concatenate([points_of(first) + first_shift, turned + second_shift])
     columns = table.columns
-    np.testing.assert_allclose(table.points, expected, atol=1e-12)
+    assert_allclose(table.points, expected, atol=1e-12)
     assert columns["scan"].tolist() == [0] * 30 + [1] * 30
     assert columns["red"].dtype == np.uint8
-    np.testing.assert_array_equal(columns["red"][:30], first["colorRed"])
-    np.testing.assert_array_equal(columns["intensity"][30:], second["intensity"])
+    assert_array_equal(columns["red"][:30], first["colorRed"])
+    assert_array_equal(columns["intensity"][30:], second["intensity"])
 
 
 def test_downsample_e57_leaves_invalid_points_out(tmp_path):
@@ -83,7 +84,7 @@ def test_broken_e57_is_named(tmp_path):
     (tmp_path / "a.e57").write_bytes(b"ASTM-E57" + bytes(90))
 
     with pytest.raises(UserError, match=r"a\.e57 is broken"):
-        read(tmp_path / "a.e57", 9, 0)
+        contents(tmp_path / "a.e57")
 
 
 @pytest.mark.parametrize(

@@ -7,13 +7,16 @@ import laspy
 import lazrs
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from mops_lightning.data.formats.area import Area
 from mops_lightning.data.formats.las import chunks
 from mops_lightning.data.formats.las.header import read_header
-from mops_lightning.data.formats.registry import WRITERS, open_cloud_file, read, write
+from mops_lightning.data.formats.registry import open_cloud_file, read, write
 from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import UserError
+from tests.support.cloud_files import contents, write_cloud, write_table
+from tests.support.clouds import normal_points
 from tests.support.copc import write_copc
 
 RECORDS, NUMBER, EVLRS, LONG_NUMBER = 100, 107, 243, 247
@@ -40,12 +43,12 @@ def test_las_keeps_format_scale_and_dimensions(tmp_path):
     cloud.write(source)
 
     table = read(source, 100, 0)
-    WRITERS[".las"](copy, table.take(np.array([3, 5])))
+    write_table(copy, table.take(np.array([3, 5])))
 
     again = laspy.read(copy)
     assert again.header.point_format.id == 6
     assert list(again.intensity) == [3, 5]
-    np.testing.assert_array_equal(again.header.scales, [0.01, 0.01, 0.01])
+    assert_array_equal(again.header.scales, [0.01, 0.01, 0.01])
 
 
 def read_rows(path, chunked, number):
@@ -53,14 +56,14 @@ def read_rows(path, chunked, number):
     if chunked:
         open_cloud_file(path).read(range(number))
     else:
-        read(path, 9, 0)
+        contents(path)
 
 
 @pytest.mark.parametrize("chunked", [True, False])
 def test_las_truncated_between_points_is_broken(chunked, tmp_path):
     path = tmp_path / "a.las"
-    points = np.random.default_rng(1).normal(size=(90, 3))
-    WRITERS[".las"](path, Table(points))
+    points = normal_points(90, 1)
+    write_cloud(path, points)
     with laspy.open(path) as file:
         length = file.header.point_format.size
     content = path.read_bytes()
@@ -74,7 +77,7 @@ def test_las_truncated_between_points_is_broken(chunked, tmp_path):
 def test_laz_damaged_is_broken(size, tmp_path):
     path = tmp_path / "a.laz"
     points = np.random.default_rng(1).uniform(0, 50, size=(3000, 3))
-    WRITERS[".laz"](path, Table(points))
+    write_cloud(path, points)
     content = bytearray(path.read_bytes())
     noise = np.random.default_rng(2).integers(0, 256, 900, np.uint8)
     content[600:1500] = bytes(noise)
@@ -97,9 +100,9 @@ def test_las_arrays_and_extended_records_are_kept(tmp_path):
     cloud["Height"] = np.arange(30)
     cloud.write(source)
 
-    whole = read(source, 9, 0)
+    whole = contents(source)
     by_rows = open_cloud_file(source).read(range(30))
-    WRITERS[".laz"](copy, whole.take(np.array([3, 5])))
+    write_table(copy, whole.take(np.array([3, 5])))
 
     second_colour = list(range(1, 90, 3))
     assert whole.columns["Colors_1"].tolist() == second_colour
@@ -112,7 +115,7 @@ def test_las_arrays_and_extended_records_are_kept(tmp_path):
 
 
 def test_copc_is_written_to_las_without_its_index(scan, tmp_path):
-    write(tmp_path / "a.las", read(scan, 9, 0))
+    write(tmp_path / "a.las", contents(scan))
 
     again = laspy.read(tmp_path / "a.las")
     assert len(again.points) == 30_000
@@ -143,7 +146,7 @@ def test_las_impossible_count_is_broken(name, form, place, kind, value, said, tm
     struct.pack_into(kind, content, place, value)
     path.write_bytes(content)
     with pytest.raises(UserError, match=said):
-        read(path, 9, 0)
+        contents(path)
     with pytest.raises(UserError, match=said):
         open_cloud_file(path).read(range(301))
 
@@ -169,7 +172,7 @@ def test_laz_with_extra_bytes_reads(form, tmp_path):
     cloud = las_cloud(header, 300)
     cloud["depth"] = np.arange(300)
     cloud.write(path)
-    np.testing.assert_array_equal(read(path, 9, 0).columns["depth"], np.arange(300))
+    assert_array_equal(contents(path).columns["depth"], np.arange(300))
 
 
 def write_scan(path, number):
@@ -200,7 +203,7 @@ def test_area_by_bounds_equals_all_points_clipped(bounds, scan, tmp_path):
     plain = tmp_path / "plain.las"
     area = Area.parse(bounds, None, None)
     assert area is not None
-    whole = read(scan, 9, 0)
+    whole = contents(scan)
     write(plain, whole)
     above_low = whole.points >= area.low
     below_high = whole.points <= area.high
@@ -273,7 +276,7 @@ def test_box_outside_of_las_or_file_without_levels_says_so(scan, tmp_path):
 
     for suffix in (".las", ".npy", ".xyz"):
         path = tmp_path / f"a{suffix}"
-        WRITERS[suffix](path, Table(np.eye(3)))
+        write_cloud(path, np.eye(3))
         with pytest.raises(UserError, match="need a COPC file"):
             read(path, 9, 0, Area(level=1))
 
@@ -301,8 +304,8 @@ def test_laz_with_chunks_of_any_size_is_read_by_rows(form, sizes, tmp_path):
         file.read(range(371, 400)),
     ]
 
-    np.testing.assert_array_equal(joined_intensities(tables), np.arange(400))
-    np.testing.assert_array_equal(joined_points(tables), whole.xyz)
+    assert_array_equal(joined_intensities(tables), np.arange(400))
+    assert_array_equal(joined_points(tables), whole.xyz)
 
 
 @pytest.mark.parametrize(
@@ -358,8 +361,8 @@ def test_copc_by_blocks_of_rows_equals_whole_file(scan):
 
     tables = [file.read(rows) for rows in file.row_ranges(700)]
 
-    np.testing.assert_array_equal(joined_points(tables), whole.xyz)
-    np.testing.assert_array_equal(joined_intensities(tables), whole.intensity)
+    assert_array_equal(joined_points(tables), whole.xyz)
+    assert_array_equal(joined_intensities(tables), whole.intensity)
 
 
 def test_real_copc_file_is_read_by_blocks(real_data):
@@ -369,7 +372,7 @@ def test_real_copc_file_is_read_by_blocks(real_data):
 
     tables = [file.read(rows) for rows in file.row_ranges(100_000)]
 
-    np.testing.assert_array_equal(joined_points(tables), whole.xyz)
+    assert_array_equal(joined_points(tables), whole.xyz)
 
 
 @pytest.mark.parametrize(
@@ -390,7 +393,7 @@ def test_laz_with_compressed_points_of_another_length_is_broken(name, length, tm
     message = f"the record of its compression has points of {length} bytes"
 
     with pytest.raises(UserError, match=message):
-        read(path, 9, 0)
+        contents(path)
     with pytest.raises(UserError, match=message):
         open_cloud_file(path).read(range(9))
 
@@ -404,4 +407,4 @@ def test_laz_with_fewer_items_than_announced_is_broken(tmp_path):
     path.write_bytes(content)
 
     with pytest.raises(UserError, match="compression is too short for 999 items"):
-        read(path, 9, 0)
+        contents(path)

@@ -7,12 +7,14 @@ import copclib
 import laspy
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from mops_lightning.data.formats.area import Area
 from mops_lightning.data.formats.las.columns import LasColumns
 from mops_lightning.data.formats.registry import open_cloud_file, read, write
 from mops_lightning.data.formats.table import Table, TableParts
 from mops_lightning.errors import UserError
+from tests.support.clouds import uniform_points
 from tests.support.las import full_cloud, header_fields
 
 MINOR, BOUNDS, WAVEFORMS = 25, 179, 227
@@ -39,8 +41,8 @@ def test_points_outside_of_the_headers_bounds_are_read_on_every_path(name, tmp_p
     parts = [file.read(rows).points for rows in file.row_ranges(70)]
     in_area = read(path, 1, 0, Area(low, high))
 
-    np.testing.assert_array_equal(whole.points, cloud.xyz)
-    np.testing.assert_array_equal(np.concatenate(parts), cloud.xyz)
+    assert_array_equal(whole.points, cloud.xyz)
+    assert_array_equal(np.concatenate(parts), cloud.xyz)
     assert len(in_area.points) == 300
 
 
@@ -68,7 +70,7 @@ def test_las_15_keeps_points_and_header_with_its_times(tmp_path):
 
     cloud = laspy.read(path)
     again = laspy.read(out)
-    np.testing.assert_array_equal(again.points.array, cloud.points.array[7:40])
+    assert_array_equal(again.points.array, cloud.points.array[7:40])
     assert header_fields(out) == header_fields(path)
     assert again.header.gps_time_offset == 1234
     assert again.header.min_gps_time == again.gps_time.min()
@@ -110,7 +112,7 @@ def test_waveforms_inside_of_the_file_are_refused_unless_left_out(tmp_path):
     write(tmp_path / "out.las", table.without_attributes())
 
     again = laspy.read(tmp_path / "out.las")
-    np.testing.assert_array_equal(again.xyz, laspy.read(path).xyz)
+    assert_array_equal(again.xyz, laspy.read(path).xyz)
     assert not again.header.start_of_waveform_data_packet_record
 
 
@@ -137,8 +139,8 @@ def test_undocumented_bytes_stay_and_are_documented_beside_a_new_dimension(tmp_p
     length = 300 * size
     assert same.read_bytes()[-length:] == path.read_bytes()[-length:]
     again = laspy.read(longer)
-    np.testing.assert_array_equal(again["label"], label)
-    np.testing.assert_array_equal(bytes_by_point(again)[:, :size], bytes_by_point(cloud))
+    assert_array_equal(again["label"], label)
+    assert_array_equal(bytes_by_point(again)[:, :size], bytes_by_point(cloud))
 
 
 @pytest.mark.parametrize("form", [0, 1, 2, 3, 6, 7, 8])
@@ -150,7 +152,7 @@ def test_written_laz_is_equal_in_both_of_laspys_backends(form, tmp_path):
 
     for backend in (laspy.LazBackend.Lazrs, laspy.LazBackend.Laszip):
         again = laspy.read(tmp_path / "out.laz", laz_backend=backend)
-        np.testing.assert_array_equal(again.points.array, cloud.points.array)
+        assert_array_equal(again.points.array, cloud.points.array)
 
 
 @pytest.mark.parametrize("form", range(11))
@@ -175,7 +177,7 @@ def test_written_laz_is_read_by_copclib(form, tmp_path):
 
     points = copclib.LazReader(str(out)).GetPoints()
     coordinates = np.array([(p.x, p.y, p.z) for p in points])
-    np.testing.assert_array_equal(coordinates, cloud.xyz)
+    assert_array_equal(coordinates, cloud.xyz)
     assert [p.gps_time for p in points] == list(cloud.gps_time)
     assert [p.classification for p in points] == list(cloud.classification)
     assert [p.return_number for p in points] == list(cloud.return_number)
@@ -185,7 +187,7 @@ def test_written_laz_is_read_by_copclib(form, tmp_path):
 
 
 def test_columns_of_other_formats_become_dimensions(tmp_path):
-    points = np.random.default_rng(0).random((20, 3))
+    points = uniform_points(20, 0)
     columns = {
         "classification": np.arange(20) + 250,  # too large for eight bits
         "a name of more than thirty-two bytes, cut": np.arange(20.0),
@@ -206,7 +208,7 @@ def test_columns_of_other_formats_become_dimensions(tmp_path):
         "half",
     ]
     for name, column in zip(names, columns.values(), strict=True):
-        np.testing.assert_array_equal(again[name], column)
+        assert_array_equal(again[name], column)
     assert set(np.asarray(again.return_number)) == {1}
 
 
@@ -327,7 +329,7 @@ def test_another_grid_of_coordinates_is_said_with_the_largest_change(name, tmp_p
 
     write(out, read(source, 1, 0))
 
-    np.testing.assert_array_equal(laspy.read(out).xyz, np.rint(points))
+    assert_array_equal(laspy.read(out).xyz, np.rint(points))
     assert capsys.readouterr().out.endswith(
         f"{name}: coordinates are on a grid of 1, which changes them by up to 0.5\n"
     )
@@ -341,5 +343,5 @@ def test_coordinates_that_a_grid_holds_are_written_without_a_word(tmp_path, caps
 
     write(out, read(source, 1, 0))
 
-    np.testing.assert_array_equal(laspy.read(out).x, [0, 1])
+    assert_array_equal(laspy.read(out).x, [0, 1])
     assert capsys.readouterr().out == ""

@@ -2,8 +2,8 @@
 
 import pytest
 
-from mops_lightning.data.formats.registry import read
 from mops_lightning.errors import UserError
+from tests.support.cloud_files import contents
 
 SCAN = (
     "2\n2\n1 2 3\n1 0 0\n0 1 0\n0 0 1\n"
@@ -16,7 +16,7 @@ SCAN = (
 def test_read_ptx_applies_the_pose_and_leaves_empty_cells_out(tmp_path):
     (tmp_path / "a.ptx").write_text(SCAN)
 
-    table = read(tmp_path / "a.ptx", 9, 0).finite()
+    table = contents(tmp_path / "a.ptx").finite()
 
     assert table.points.tolist() == [[100, 201, 300], [99, 200, 300], [100, 200, 301]]
     assert table.columns["intensity"].tolist() == [0.5, 0.25, 1]
@@ -27,7 +27,7 @@ def test_read_ptx_applies_the_pose_and_leaves_empty_cells_out(tmp_path):
 def test_read_ptx_of_several_scans_numbers_them(tmp_path):
     (tmp_path / "a.ptx").write_text(SCAN + SCAN.replace("100 200 300 1", "0 0 0 1"))
 
-    table = read(tmp_path / "a.ptx", 9, 0).finite()
+    table = contents(tmp_path / "a.ptx").finite()
 
     assert table.columns["scan"].tolist() == [0, 0, 0, 1, 1, 1]
     assert table.points[3].tolist() == [0, 1, 0]
@@ -45,7 +45,7 @@ def test_read_ptx_of_several_scans_numbers_them(tmp_path):
 def test_read_pts_knows_columns_by_their_number(row, names, tmp_path):
     (tmp_path / "a.pts").write_text(f"3\n{row}\n{row}\n{row}\n")
 
-    table = read(tmp_path / "a.pts", 9, 0)
+    table = contents(tmp_path / "a.pts")
 
     assert table.points.tolist() == [[1, 2, 3]] * 3
     assert list(table.columns) == names
@@ -54,7 +54,7 @@ def test_read_pts_knows_columns_by_their_number(row, names, tmp_path):
 def test_read_pts_of_several_blocks_is_one_cloud(tmp_path):
     (tmp_path / "a.pts").write_text("1\n1 2 3 7\n2\n4 5 6 8\n7 8 9 9\n")
 
-    assert read(tmp_path / "a.pts", 9, 0).columns["intensity"].tolist() == [7, 8, 9]
+    assert contents(tmp_path / "a.pts").columns["intensity"].tolist() == [7, 8, 9]
 
 
 @pytest.mark.parametrize(
@@ -73,4 +73,4 @@ def test_broken_file_is_named(name, text, said, tmp_path):
     (tmp_path / name).write_text(text)
 
     with pytest.raises(UserError, match=rf"{name}.*{said}"):
-        read(tmp_path / name, 9, 0)
+        contents(tmp_path / name)

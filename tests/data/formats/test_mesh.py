@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mops_lightning.data.formats import isolated
 from mops_lightning.data.formats.guard import BadCloudError
@@ -24,8 +25,8 @@ def test_parse_formats_give_same_surface(tmp_path, suffix):
         options = {"file_type": "stl_ascii"}
     path = write_mesh(tmp_path / f"mesh.{suffix}", BOX, **options)
     mesh = parse_mesh(path.read_bytes(), path)
-    np.testing.assert_allclose(mesh.bounds, BOX.bounds)
-    np.testing.assert_allclose(mesh.area, BOX.area)
+    assert_allclose(mesh.bounds, BOX.bounds)
+    assert_allclose(mesh.area, BOX.area)
 
 
 @pytest.mark.parametrize(
@@ -47,8 +48,8 @@ def test_parse_off_header_variants(head):
 
     mesh = parse_mesh(text.encode(), Path("m.off"))
 
-    np.testing.assert_allclose(mesh.vertices, ball.vertices, atol=1e-9)
-    np.testing.assert_array_equal(mesh.faces, ball.faces)
+    assert_allclose(mesh.vertices, ball.vertices, atol=1e-9)
+    assert_array_equal(mesh.faces, ball.faces)
 
 
 @pytest.mark.parametrize(
@@ -65,8 +66,8 @@ def test_parse_scene_applies_transforms(tmp_path):
     scene.add_geometry(BOX, transform=turn)
     path = write_mesh(tmp_path / "scene.glb", scene)
     mesh = parse_mesh(path.read_bytes(), path)
-    np.testing.assert_allclose(mesh.area, 2 * BOX.area)
-    np.testing.assert_allclose(mesh.bounds, scene.bounds)
+    assert_allclose(mesh.area, 2 * BOX.area)
+    assert_allclose(mesh.bounds, scene.bounds)
     assert mesh.bounds[1, 0] < 7
 
 
@@ -161,7 +162,7 @@ def test_ascii_stl_normals_of_the_file_are_ignored(normal):
 
     mesh = parse_mesh(text.encode(), Path("a.stl"))
 
-    np.testing.assert_allclose(mesh.face_normals, [[0, 0, 1]])
+    assert_allclose(mesh.face_normals, [[0, 0, 1]])
 
 
 def test_obj_of_many_materials_is_read(tmp_path):

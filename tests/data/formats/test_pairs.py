@@ -4,9 +4,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
-from mops_lightning.data.formats.registry import read, write
+from mops_lightning.data.formats.registry import write
 from mops_lightning.data.formats.table import Form, Table
+from tests.support.cloud_files import contents
 
 EXACT = (".ply", ".pcd", ".npz", ".txt", ".xyz", ".npy")
 """Formats that hold float64 coordinates."""
@@ -33,9 +35,9 @@ def table():
 def test_coordinates_of_every_pair_are_the_same_to_the_bit(source, target, table, tmp_path):
     write(tmp_path / f"a{source}", table)
 
-    write(tmp_path / f"b{target}", read(tmp_path / f"a{source}", 9, 0))
+    write(tmp_path / f"b{target}", contents(tmp_path / f"a{source}"))
 
-    np.testing.assert_array_equal(read(tmp_path / f"b{target}", 9, 0).points, table.points)
+    assert_array_equal(contents(tmp_path / f"b{target}").points, table.points)
 
 
 @pytest.mark.parametrize("source", NAMED)
@@ -43,10 +45,10 @@ def test_coordinates_of_every_pair_are_the_same_to_the_bit(source, target, table
 def test_columns_of_every_pair_keep_names_and_numbers(source, target, table, tmp_path):
     write(tmp_path / f"a{source}", table)
 
-    write(tmp_path / f"b{target}", read(tmp_path / f"a{source}", 9, 0))
+    write(tmp_path / f"b{target}", contents(tmp_path / f"a{source}"))
 
-    again = read(tmp_path / f"b{target}", 9, 0).columns
+    again = contents(tmp_path / f"b{target}").columns
     for name, column in table.columns.items():
         # Text is read as float64, a LAS dimension of the name may have another type.
         kept = again.get(f"{name}_", again[name])
-        np.testing.assert_array_equal(kept.astype(column.dtype), column)
+        assert_array_equal(kept.astype(column.dtype), column)

@@ -4,10 +4,11 @@ import struct
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from mops_lightning.data.formats import pcd
-from mops_lightning.data.formats.registry import read
 from mops_lightning.errors import UserError
+from tests.support.cloud_files import contents
 
 HEAD = (
     "FIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\nWIDTH 40\nHEIGHT 1\nPOINTS 40\n"
@@ -39,8 +40,8 @@ def test_pcd_every_encoding_is_read(tmp_path):
         path = tmp_path / f"{kind}.pcd"
         path.write_bytes(f"# comment\nVERSION .7\n{HEAD}DATA {kind}\n".encode() + body)
         table = pcd.read(path)
-        np.testing.assert_array_equal(table.points, points)
-        np.testing.assert_array_equal(table.columns["rgb"], colour)
+        assert_array_equal(table.points, points)
+        assert_array_equal(table.columns["rgb"], colour)
 
 
 def test_pcd_impossible_count_is_broken(tmp_path):
@@ -48,7 +49,7 @@ def test_pcd_impossible_count_is_broken(tmp_path):
     head = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 1\nPOINTS 99999999999\nDATA ascii\n"
     path.write_text(head)
     with pytest.raises(UserError, match="bytes are not 99999999999 points"):
-        read(path, 9, 0)
+        contents(path)
 
 
 def test_pcd_unknown_encoding_is_refused(tmp_path):
@@ -56,14 +57,14 @@ def test_pcd_unknown_encoding_is_refused(tmp_path):
     path.write_text(f"{HEAD}DATA zipped\n")
 
     with pytest.raises(UserError, match="DATA zipped, not ascii, binary or binary_compressed"):
-        read(path, 9, 0)
+        contents(path)
 
 
 def test_pcd_compressed_by_open3d_is_read(tmp_path):
     path = tmp_path / "a.pcd"
     path.write_bytes(COMPRESSED_HEAD + COMPRESSED_SIZES + COMPRESSED)
 
-    table = read(path, 9, 0)
+    table = contents(path)
 
     first = [[0.0, 1.0, 2.0]] * 10
     second = [[0.5, -1.0, 2.0]] * 10
@@ -84,13 +85,13 @@ def test_pcd_broken_compression_is_refused(tmp_path, body, message):
     path.write_bytes(COMPRESSED_HEAD + body)
 
     with pytest.raises(UserError, match=f"a.pcd is broken: .*{message}"):
-        read(path, 9, 0)
+        contents(path)
 
 
 def test_pcd_fields_of_several_numbers_are_kept(tmp_path):
     head = "FIELDS x y z fpfh\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 2\nWIDTH 3\nPOINTS 3\n"
     lines = "".join(f"{row} 0 0 {row}.5 {row}.25\n" for row in range(3))
     (tmp_path / "a.pcd").write_text(f"{head}DATA ascii\n{lines}")
-    table = read(tmp_path / "a.pcd", 9, 0)
+    table = contents(tmp_path / "a.pcd")
     assert list(table.columns) == ["fpfh_0", "fpfh_1"]
     assert table.columns["fpfh_1"].tolist() == [0.25, 1.25, 2.25]

@@ -5,10 +5,12 @@ import struct
 import numpy as np
 import pytest
 import trimesh
+from numpy.testing import assert_array_equal
 
-from mops_lightning.data.formats.registry import WRITERS, open_cloud_file, read
-from mops_lightning.data.formats.table import Table
+from mops_lightning.data.formats.registry import open_cloud_file, read
 from mops_lightning.errors import UserError
+from tests.support.cloud_files import contents, write_cloud
+from tests.support.clouds import normal_points
 
 
 def test_ply_ascii_cloud_and_binary_mesh_are_read(tmp_path):
@@ -17,9 +19,9 @@ def test_ply_ascii_cloud_and_binary_mesh_are_read(tmp_path):
     path.write_text(
         f"ply\nformat ascii 1.0\nelement vertex 2\n{rows}end_header\n1 2 3 9\n4 5 6 8\n"
     )
-    table = read(path, 9, 0)
-    np.testing.assert_array_equal(table.points, [[1, 2, 3], [4, 5, 6]])
-    np.testing.assert_array_equal(table.columns["red"], [9, 8])
+    table = contents(path)
+    assert_array_equal(table.points, [[1, 2, 3], [4, 5, 6]])
+    assert_array_equal(table.columns["red"], [9, 8])
     trimesh.creation.icosphere().export(tmp_path / "ball.ply")
     surface = read(tmp_path / "ball.ply", 500, 0)
     assert surface.points.shape == (500, 3)
@@ -39,9 +41,9 @@ HEADS = {
 @pytest.mark.parametrize("kind", HEADS)
 def test_ply_header_variant_is_read(kind, tmp_path):
     path = tmp_path / "a.ply"
-    points = np.random.default_rng(1).normal(size=(50, 3)).astype(np.float32).astype(float)
+    points = normal_points(50, 1).astype(np.float32).astype(float)
     red = np.arange(50, dtype=np.uint8)
-    WRITERS[".ply"](path, Table(points, {"red": red}))
+    write_cloud(path, points, {"red": red})
     head, end, rows = path.read_bytes().partition(b"end_header\n")
     usual, variant = HEADS[kind]
     changed = (head + end).decode().replace(usual, variant)
@@ -49,8 +51,8 @@ def test_ply_header_variant_is_read(kind, tmp_path):
 
     table = open_cloud_file(path).read(range(10, 50))
 
-    np.testing.assert_array_equal(table.points, points[10:])
-    np.testing.assert_array_equal(table.columns["red"], red[10:])
+    assert_array_equal(table.points, points[10:])
+    assert_array_equal(table.columns["red"], red[10:])
 
 
 def test_ply_vertices_with_lists_are_rejected(tmp_path):
@@ -64,7 +66,7 @@ def test_ply_vertices_with_lists_are_rejected(tmp_path):
 
 def test_ply_chunked_impossible_count_is_broken(tmp_path):
     path = tmp_path / "a.ply"
-    WRITERS[".ply"](path, Table(np.ones((5, 3))))
+    write_cloud(path, np.ones((5, 3)))
     path.write_bytes(path.read_bytes().replace(b"vertex 5", b"vertex 999999999999"))
     with pytest.raises(UserError, match="ends after 5 points"):
         open_cloud_file(path)
@@ -97,7 +99,7 @@ def test_ply_line_ends_and_latin_comments_are_read(end, form, tmp_path):
     head = end.join(lines).encode("latin-1")
     path.write_bytes(head + two_rows(form, end))
 
-    points = read(path, 9, 0).points
+    points = contents(path).points
 
     assert points.tolist() == [[1, 2, 3], [4, 5, 10]]
     if form != "ascii":
@@ -112,5 +114,5 @@ def test_ply_texture_comment_opens_no_file(tmp_path, monkeypatch):
     path.write_bytes(content.replace(b"comment TextureFile", b"comment  TextureFile"))
     opened = []
     monkeypatch.setattr("PIL.Image.open", lambda *a: opened.append(a))
-    assert len(read(path, 9, 0).points) == 9
+    assert len(contents(path).points) == 9
     assert not opened

@@ -8,10 +8,13 @@ import laspy
 import numpy as np
 import pytest
 import trimesh
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mops_lightning.data.formats.registry import WRITERS, open_cloud_file, read, write
 from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import UserError
+from tests.support.cloud_files import contents, write_cloud, write_table
+from tests.support.clouds import normal_points, uniform_points
 from tests.support.full_disk import full_disk
 
 
@@ -29,7 +32,7 @@ def table():
 
 def written(table, suffix, tmp_path):
     path = tmp_path / f"cloud{suffix}"
-    WRITERS[suffix](path, table)
+    write_table(path, table)
     return path
 
 
@@ -39,18 +42,18 @@ def test_points_and_columns_round_trip(table, suffix, tmp_path):
 
     again = read(path, 100, 0)
 
-    np.testing.assert_allclose(again.points, table.points, rtol=1e-7, atol=1e-9)
+    assert_allclose(again.points, table.points, rtol=1e-7, atol=1e-9)
     assert list(again.columns) == list(table.columns)
     for name, column in table.columns.items():
-        np.testing.assert_allclose(again.columns[name], column, rtol=1e-6)
+        assert_allclose(again.columns[name], column, rtol=1e-6)
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".bin", ".las", ".laz"])
 def test_points_round_trip(table, suffix, tmp_path):
     again = read(written(table, suffix, tmp_path), 100, 0)
-    np.testing.assert_allclose(again.points, table.points, atol=1e-6)
+    assert_allclose(again.points, table.points, atol=1e-6)
     if suffix == ".bin":
-        np.testing.assert_array_equal(again.columns["intensity"], table.columns["intensity"])
+        assert_array_equal(again.columns["intensity"], table.columns["intensity"])
 
 
 AWKWARD = {
@@ -71,7 +74,7 @@ def test_written_ply_opens_in_trimesh(table, tmp_path):
 
     cloud: Any = trimesh.load(path)
 
-    np.testing.assert_allclose(cloud.vertices, table.points, atol=1e-6)
+    assert_allclose(cloud.vertices, table.points, atol=1e-6)
 
 
 def test_written_laz_opens_in_laspy(table, tmp_path):
@@ -79,26 +82,26 @@ def test_written_laz_opens_in_laspy(table, tmp_path):
 
     las = laspy.read(path)
 
-    np.testing.assert_allclose(las.xyz, table.points, atol=1e-6)
-    np.testing.assert_array_equal(las["label"], table.columns["label"])
+    assert_allclose(las.xyz, table.points, atol=1e-6)
+    assert_array_equal(las["label"], table.columns["label"])
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".pcd", ".npz", ".txt", ".las"])
 def test_awkward_columns_keep_numbers(suffix, tmp_path):
-    unit = np.random.default_rng(0).random((4, 3))
+    unit = uniform_points(4, 0)
     points = unit + np.array([1e6, 0, 0])
     path = written(Table(points, AWKWARD), suffix, tmp_path)
 
-    again = read(path, 9, 0)
+    again = contents(path)
 
-    np.testing.assert_allclose(again.points, points, rtol=0, atol=1e-6)
+    assert_allclose(again.points, points, rtol=0, atol=1e-6)
     columns = [column for column in again.columns.values() if column.any()]
     for name, column in AWKWARD.items():
         is_equal = [np.array_equal(found, column) for found in columns]
         assert any(is_equal), name
 
 
-FAR = np.random.default_rng(0).random((20, 3)) + np.array([1e9, 5.4e6, 100])
+FAR = uniform_points(20, 0) + np.array([1e9, 5.4e6, 100])
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".pcd", ".npy", ".npz", ".xyz", ".las"])
@@ -107,7 +110,7 @@ def test_coordinates_far_from_origin_keep_digits(suffix, tmp_path):
 
     again = read(path, 100, 0)
 
-    np.testing.assert_allclose(again.points, FAR, rtol=0, atol=1e-6)
+    assert_allclose(again.points, FAR, rtol=0, atol=1e-6)
 
 
 def test_coordinates_far_from_origin_are_not_written_in_single_precision(tmp_path):
@@ -120,14 +123,14 @@ def test_strings_and_dates_of_a_structured_array_are_left_out(tmp_path):
     fields = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("n", "U3"), ("d", "M8[s]")]
     np.save(path, np.zeros(3, fields))
 
-    assert not read(path, 9, 0).columns
+    assert not contents(path).columns
 
 
 def test_strings_of_an_npz_file_are_left_out(tmp_path):
     path = tmp_path / "a.npz"
     np.savez(path, points=np.ones((3, 3)), names=np.array(["a", "b", "c"]))
 
-    assert not read(path, 9, 0).columns
+    assert not contents(path).columns
 
 
 WITH_LIST = """\
@@ -147,7 +150,7 @@ def test_lists_of_a_ply_file_are_left_out(tmp_path):
     row = struct.pack("<fffBi", 1, 2, 3, 1, 5)
     path.write_bytes(WITH_LIST.encode() + row + row)
 
-    table = read(path, 9, 0)
+    table = contents(path)
 
     assert table.points.tolist() == [[1, 2, 3], [1, 2, 3]]
     first = table.take(np.array([0]))
@@ -157,9 +160,9 @@ def test_lists_of_a_ply_file_are_left_out(tmp_path):
 @pytest.mark.parametrize("suffix", [".ply", ".npy", ".bin", ".las", ".laz"])
 def test_row_range_equals_slice_of_file(suffix, tmp_path):
     path = tmp_path / f"in{suffix}"
-    points = np.random.default_rng(1).normal(size=(500, 3)).astype(np.float32).astype(float)
+    points = normal_points(500, 1).astype(np.float32).astype(float)
     intensity = np.arange(500, dtype=np.uint16)
-    WRITERS[suffix](path, Table(points, {"intensity": intensity}))
+    write_cloud(path, points, {"intensity": intensity})
 
     cloud = open_cloud_file(path)
     whole = cloud.read(range(500)).points
@@ -169,10 +172,10 @@ def test_row_range_equals_slice_of_file(suffix, tmp_path):
 
     assert cloud.number == 500
     assert list(cloud.row_ranges(200)) == [range(200), range(200, 400), range(400, 500)]
-    np.testing.assert_allclose(whole, points, atol=1e-6)
-    np.testing.assert_array_equal(first, whole[:3])
-    np.testing.assert_array_equal(middle, whole[200:400])
-    np.testing.assert_array_equal(last, whole[499:])
+    assert_allclose(whole, points, atol=1e-6)
+    assert_array_equal(first, whole[:3])
+    assert_array_equal(middle, whole[200:400])
+    assert_array_equal(last, whole[499:])
 
 
 ASCII = (
@@ -219,12 +222,12 @@ def test_pipe_and_endless_device_are_no_files(tmp_path):
     (tmp_path / "a.bin").symlink_to("/dev/zero")
     for name in ("a.ply", "a.bin"):
         with pytest.raises(UserError, match=rf"{name}: not a file"):
-            read(tmp_path / name, 9, 0)
+            contents(tmp_path / name)
 
 
 @pytest.mark.parametrize("suffix", WRITERS)
 def test_full_disk_is_one_error(suffix, tmp_path):
-    random = np.random.default_rng(0).normal(size=(3000, 3))
+    random = normal_points(3000, 0)
     with pytest.raises(UserError, match=rf"write .*a{suffix} \((?!.*None)"), full_disk():
         write(tmp_path / f"a{suffix}", Table(random))
     assert not list(tmp_path.iterdir())

@@ -7,12 +7,12 @@ from threading import Thread
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from mops_lightning.data.formats.area import Area
-from mops_lightning.data.formats.registry import WRITERS, read
 from mops_lightning.data.formats.remote import local
-from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import UserError
+from tests.support.cloud_files import contents, write_cloud
 from tests.support.copc import write_copc
 from tests.support.downsample import call, done
 
@@ -52,7 +52,7 @@ def server(tmp_path_factory):
     sent: list[int] = []
     points = np.random.default_rng(0).uniform(0, 100, (150_000, 3)) * [1, 1, 0.1]
     write_copc(folder / "scan.copc.laz", points, spacing=8.0)
-    WRITERS[".laz"](folder / "plain.laz", Table(points[:50]))
+    write_cloud(folder / "plain.laz", points[:50])
     server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, folder, sent))
     Thread(target=server.serve_forever, daemon=True).start()
     yield f"http://127.0.0.1:{server.server_port}", folder, sent
@@ -71,9 +71,9 @@ def test_area_of_remote_file_equals_local_file(options, server, tmp_path):
     assert sum(sent) < 0.25 * size
     assert f"of {size / 1e6:,.1f} MB" in out
     assert call(folder / "scan.copc.laz", tmp_path / "b.laz", *options)[0] == 0
-    one, two = (read(tmp_path / name, 9, 0) for name in ("a.laz", "b.laz"))
-    np.testing.assert_array_equal(one.points, two.points)
-    np.testing.assert_array_equal(one.columns["intensity"], two.columns["intensity"])
+    one, two = (contents(tmp_path / name) for name in ("a.laz", "b.laz"))
+    assert_array_equal(one.points, two.points)
+    assert_array_equal(one.columns["intensity"], two.columns["intensity"])
 
 
 @pytest.mark.parametrize(

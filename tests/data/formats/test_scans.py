@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from mops_lightning.data.formats.bin_columns import parse_columns
 from mops_lightning.data.formats.registry import open_cloud_file, read, write
 from mops_lightning.errors import UserError
+from tests.support.cloud_files import contents
 
 NUSCENES = ("x", "y", "z", "intensity", "ring")
 
@@ -25,12 +27,12 @@ def test_read_pcd_bin_has_five_columns_in_parts_too(sweep, tmp_path):
     path = tmp_path / "n015__LIDAR_TOP__1.pcd.bin"
     sweep.tofile(path)
 
-    whole = read(path, 9, 0)
+    whole = contents(path)
     part = open_cloud_file(path).read(range(100, 200))
 
-    np.testing.assert_array_equal(whole.points, sweep[:, :3])
-    np.testing.assert_array_equal(whole.columns["ring"], sweep[:, 4])
-    np.testing.assert_array_equal(part.columns["intensity"], sweep[100:200, 3])
+    assert_array_equal(whole.points, sweep[:, :3])
+    assert_array_equal(whole.columns["ring"], sweep[:, 4])
+    assert_array_equal(part.columns["intensity"], sweep[100:200, 3])
 
 
 def test_read_bin_with_other_columns_asks_for_their_names(sweep, tmp_path):
@@ -38,12 +40,12 @@ def test_read_bin_with_other_columns_asks_for_their_names(sweep, tmp_path):
     sweep.tofile(path)  # 8,000 bytes would also be 500 rows of four columns
 
     with pytest.raises(UserError, match="Name its columns, such as --columns"):
-        read(path, 9, 0)
+        contents(path)
     with pytest.raises(UserError, match="does not look like"):
         open_cloud_file(path)
     table = read(path, 9, 0, columns=NUSCENES)
 
-    np.testing.assert_array_equal(table.points, sweep[:, :3])
+    assert_array_equal(table.points, sweep[:, :3])
 
 
 def test_read_bin_of_room_with_colours_is_refused(tmp_path):
@@ -52,14 +54,14 @@ def test_read_bin_of_room_with_colours_is_refused(tmp_path):
     rows.astype(np.float32).tofile(tmp_path / "room.bin")
 
     with pytest.raises(UserError, match="does not look like rows of x, y, z, intensity"):
-        read(tmp_path / "room.bin", 9, 0)
+        contents(tmp_path / "room.bin")
 
 
 def test_read_bin_of_three_columns_is_refused_by_its_size(tmp_path):
     np.ones((399, 3), np.float32).tofile(tmp_path / "a.bin")
 
     with pytest.raises(UserError, match=r"4788 bytes are not rows of 4 float32 .*--columns"):
-        read(tmp_path / "a.bin", 9, 0)
+        contents(tmp_path / "a.bin")
 
 
 def rows_of_bin(path):
@@ -76,9 +78,9 @@ def test_write_bin_keeps_the_columns_that_were_read(sweep, tmp_path):
     write(copy, table)
     write(coordinates, table.without_attributes())
 
-    np.testing.assert_array_equal(rows_of_bin(copy), sweep)
+    assert_array_equal(rows_of_bin(copy), sweep)
     without_attributes = sweep * [1, 1, 1, 0, 0]
-    np.testing.assert_array_equal(rows_of_bin(coordinates), without_attributes)
+    assert_array_equal(rows_of_bin(coordinates), without_attributes)
 
 
 @pytest.mark.parametrize(
@@ -100,7 +102,7 @@ def test_read_label_file_gives_class_and_instance(scans, labels, tmp_path):
     packed = classes + (instances << 16)
     packed.tofile(label_file)
 
-    whole = read(scan, 9, 0).columns
+    whole = contents(scan).columns
     part = open_cloud_file(scan).read(range(10, 20)).columns
 
     assert whole["label"].tolist() == list(range(40))
@@ -113,7 +115,7 @@ def test_read_label_file_of_another_scan_is_refused(tmp_path):
     np.ones(39, "<u4").tofile(tmp_path / "a.label")
 
     with pytest.raises(UserError, match=r"a\.label has 156 bytes, not 4 for each of the 40 points"):
-        read(tmp_path / "a.bin", 9, 0)
+        contents(tmp_path / "a.bin")
 
 
 @pytest.mark.parametrize("text", ["x,y", "x,y,z,", "x,y,z,z", "a b c"])

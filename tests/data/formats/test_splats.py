@@ -5,10 +5,12 @@ import signal
 import gsply
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from mops_lightning.data.formats import isolated
-from mops_lightning.data.formats.registry import open_cloud_file, read, write
+from mops_lightning.data.formats.registry import open_cloud_file, write
 from mops_lightning.errors import UserError
+from tests.support.cloud_files import contents
 
 
 @pytest.fixture
@@ -29,12 +31,12 @@ def splats():
 def test_plain_splat_file_is_kept_exactly(splats, tmp_path):
     gsply.plywrite(tmp_path / "a.ply", splats)
 
-    write(tmp_path / "b.ply", read(tmp_path / "a.ply", 9, 0))
+    write(tmp_path / "b.ply", contents(tmp_path / "a.ply"))
 
     again = gsply.plyread(tmp_path / "b.ply")
-    np.testing.assert_array_equal(again.means, splats.means)
-    np.testing.assert_array_equal(again.shN, splats.shN)
-    np.testing.assert_array_equal(again.quats, splats.quats)
+    assert_array_equal(again.means, splats.means)
+    assert_array_equal(again.shN, splats.shN)
+    assert_array_equal(again.quats, splats.quats)
 
 
 @pytest.mark.parametrize("suffix", [".spz", ".compressed.ply"])
@@ -47,13 +49,13 @@ def test_compressed_splats_equal_those_that_gsply_unpacks(suffix, splats, tmp_pa
         gsply.plywrite(packed, splats, compressed=True)
         gsply.plywrite(plain, gsply.plyread(packed))
 
-    table = read(packed, 9, 0)
+    table = contents(packed)
 
-    expected = read(plain, 9, 0)
-    np.testing.assert_array_equal(table.points, expected.points)
+    expected = contents(plain)
+    assert_array_equal(table.points, expected.points)
     assert list(table.columns) == list(expected.columns)
     for name, column in expected.columns.items():
-        np.testing.assert_array_equal(table.columns[name], column)
+        assert_array_equal(table.columns[name], column)
     if suffix != ".spz":
         with pytest.raises(UserError, match="compressed PLY, which --chunk does not read"):
             open_cloud_file(packed)
@@ -63,7 +65,7 @@ def test_splat_is_refused_with_a_converter(tmp_path):
     (tmp_path / "a.splat").write_bytes(bytes(64))
 
     with pytest.raises(UserError, match=r"\.splat is not read. Convert it by SuperSplat"):
-        read(tmp_path / "a.splat", 9, 0)
+        contents(tmp_path / "a.splat")
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGALRM"), reason="the system has no timer")
@@ -77,6 +79,6 @@ def test_time_to_compile_a_reader_is_not_time_to_read(suffix, splats, tmp_path, 
     isolated._end_all()  # so that a new process has to import numba
     monkeypatch.setattr(isolated, "SECONDS", 0.0)
 
-    table = read(path, 9, 0)
+    table = contents(path)
 
     assert len(table.points) == 300

@@ -6,9 +6,11 @@ import struct
 import numpy as np
 import pytest
 import trimesh
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mops_lightning.data.formats.registry import read
 from mops_lightning.errors import UserError
+from tests.support.cloud_files import contents
 from tests.support.meshes import packed_glb, quantised_glb
 
 HEAD = """\
@@ -82,13 +84,13 @@ def test_ply_of_triangle_and_quad_is_sampled_with_its_numbers(is_ascii, tmp_path
     red = table.columns["red"]
     part = table.columns["part"]
     zone = table.columns["zone"]
-    np.testing.assert_allclose(table.columns["heat"], x, atol=1e-6)
-    np.testing.assert_array_equal(red, np.rint(100 * y))
+    assert_allclose(table.columns["heat"], x, atol=1e-6)
+    assert_array_equal(red, np.rint(100 * y))
     assert red.dtype == np.uint8
     to_corners = np.abs(table.points[:, None] - CORNERS).sum(2)
     is_near = to_corners.min(1) < 0.3
     nearest_corner = to_corners.argmin(1)
-    np.testing.assert_array_equal(part[is_near], nearest_corner[is_near])
+    assert_array_equal(part[is_near], nearest_corner[is_near])
     only_quad = y > x
     assert set(zone[only_quad]) == {6}
     assert set(zone) == {5, 6}
@@ -128,7 +130,7 @@ end_header
     content += struct.pack(">fffBiiB", 4, 5, 6, 2, 8, 7, 60)
     path.write_bytes(content)
 
-    table = read(path, 9, 0)
+    table = contents(path)
 
     assert table.points.tolist() == [[1, 2, 3], [4, 5, 6]]
     assert table.columns["red"].tolist() == [50, 60]
@@ -156,11 +158,11 @@ def test_normals_and_colours_of_vertices_reach_sampled_points(suffix, tmp_path):
 
     normals = normals_of(table)
     lengths = np.linalg.norm(normals, axis=1)
-    np.testing.assert_allclose(lengths, 1, atol=1e-6)
-    np.testing.assert_allclose(normals, table.points, atol=0.01)  # those of faces differ by 0.03
+    assert_allclose(lengths, 1, atol=1e-6)
+    assert_allclose(normals, table.points, atol=0.01)  # those of faces differ by 0.03
     red = table.columns["red"].astype(float)
     expected_red = 127 * (table.points[:, 2] + 1)
-    np.testing.assert_allclose(red, expected_red, atol=3)
+    assert_allclose(red, expected_red, atol=3)
 
 
 def test_glb_normals_follow_an_uneven_scale(tmp_path):
@@ -175,7 +177,7 @@ def test_glb_normals_follow_an_uneven_scale(tmp_path):
 
     gradients = table.points / [1, 4, 9]
     lengths = np.linalg.norm(gradients, axis=1, keepdims=True)
-    np.testing.assert_allclose(normals_of(table), gradients / lengths, atol=0.02)
+    assert_allclose(normals_of(table), gradients / lengths, atol=0.02)
 
 
 @pytest.mark.parametrize("sparse", [False, True])
@@ -196,7 +198,7 @@ def test_glb_that_needs_an_extension_is_refused_by_its_name(name, tmp_path):
     (tmp_path / "a.glb").write_bytes(packed_glb(tree, content[28 + length :]))
 
     with pytest.raises(UserError, match=rf"a\.glb.*needs the glTF extension {name}"):
-        read(tmp_path / "a.glb", 9, 0)
+        contents(tmp_path / "a.glb")
 
 
 def test_colours_that_a_part_of_a_scene_lacks_are_named(tmp_path):
@@ -207,6 +209,6 @@ def test_colours_that_a_part_of_a_scene_lacks_are_named(tmp_path):
     scene = trimesh.Scene([ball, box])
     path.write_bytes(scene.export(file_type="glb"))
 
-    table = read(path, 9, 0)
+    table = contents(path)
 
     assert table.form.left_out == ("red", "green", "blue", "alpha")

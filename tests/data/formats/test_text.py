@@ -1,9 +1,10 @@
 """Text files."""
 
-import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from mops_lightning.data.formats.registry import read
+from tests.support.cloud_files import contents
 
 
 @pytest.mark.parametrize(
@@ -24,7 +25,7 @@ from mops_lightning.data.formats.registry import read
 def test_text_dialect_is_read(text, tmp_path):
     path = tmp_path / "a.xyz"
     path.write_text(text, encoding="utf-8")
-    np.testing.assert_array_equal(read(path, 9, 0).points, [[1, 2, 3], [4, 5, 6]])
+    assert_array_equal(contents(path).points, [[1, 2, 3], [4, 5, 6]])
 
 
 def test_obj_faces_after_tab_make_a_mesh(tmp_path):

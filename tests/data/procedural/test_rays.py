@@ -6,6 +6,7 @@ import trimesh
 
 from mops_lightning.data.procedural import rays
 from mops_lightning.data.procedural.rays import NOTHING, Camera, RayGrid, nearest_faces
+from tests.support.clouds import normal_points
 
 
 @pytest.fixture
@@ -92,7 +93,7 @@ def test_nearest_faces_miss_what_is_beside_the_grid():
 
 
 def test_camera_turns_points_there_and_back(camera):
-    points = np.random.default_rng(0).normal(size=(20, 3))
+    points = normal_points(20, 0)
 
     seen = camera.seen(points)
 

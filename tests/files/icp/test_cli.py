@@ -7,9 +7,8 @@ import sys
 import numpy as np
 import pytest
 
-from mops_lightning.data.formats.registry import WRITERS
-from mops_lightning.data.formats.table import Table
 from mops_lightning.files.cli import compare
+from tests.support.cloud_files import write_cloud
 
 
 def room(number, seed):
@@ -33,7 +32,7 @@ def scans(tmp_path):
     folder = tmp_path / "scans"
     folder.mkdir()
     for number in range(2):
-        WRITERS[".ply"](folder / f"{number}.ply", Table(room(1500, number)))
+        write_cloud(folder / f"{number}.ply", room(1500, number))
     return folder
 
 
@@ -89,7 +88,7 @@ def test_frames_with_poses_are_aligned_to_the_true_motion(tmp_path, capsys):
     folder, out = tmp_path / "frames", tmp_path / "out"
     folder.mkdir()
     for number in range(3):
-        WRITERS[".ply"](folder / f"{number}.ply", Table(room(3000, number) - [0.2 * number, 0, 0]))
+        write_cloud(folder / f"{number}.ply", room(3000, number) - [0.2 * number, 0, 0])
     poses = tmp_path / "poses.txt"
     poses.write_text("".join(f"1 0 0 {0.2 * i} 0 1 0 0 0 0 1 0\n" for i in range(3)))
 

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from mops_lightning.errors import UserError
 from mops_lightning.files.icp.pairs import Pair, crop_pairs, draw_motions, frame_pairs, scans_of
+from tests.support.clouds import normal_points
 
 SCAN = Path("scan.ply")
 
@@ -30,7 +31,7 @@ def test_halves_of_crops_share_no_point_and_fill_the_unit_sphere():
 
 
 def test_crops_depend_on_the_seed_alone():
-    points = np.random.default_rng(0).normal(size=(500, 3))
+    points = normal_points(500, 0)
 
     _, first = crop_pairs([(SCAN, points)], 100, 2, seed=0)
     _, again = crop_pairs([(SCAN, points)], 100, 2, seed=0)
@@ -55,7 +56,7 @@ def test_frames_are_aligned_to_the_one_before(tmp_path):
             [0.0, 0.0, 1.0],
         ]
     )
-    room = np.random.default_rng(0).normal(size=(20, 3))
+    room = normal_points(20, 0)
     first = room - [1, 0, 0]
     second = (room - [3, 0, 0]) @ quarter_turn
     frames = [(Path("0.ply"), first), (Path("1.ply"), second)]
@@ -77,7 +78,7 @@ def test_frames_need_a_pose_each(tmp_path):
 
 
 def test_starts_are_within_the_angle_and_shift_about_the_mean_of_the_source():
-    points = np.random.default_rng(0).normal(size=(300, 3))
+    points = normal_points(300, 0)
     (pair,) = crop_pairs([(SCAN, points)], 100, 1, 0)
 
     (starts,) = draw_motions([pair], 200, angle=15.0, shift=0.1, seed=0)

@@ -5,6 +5,7 @@ import pytest
 
 from mops_lightning.config.compose import compose
 from mops_lightning.training.run.run import run
+from tests.support.cloud_files import write_cloud
 
 SMALL = [
     "trainer=cpu",
@@ -23,8 +24,6 @@ POINTS = 150
 
 def write_clouds(folder, number, seed, parts=False, height=1.0):
     """Write boxes as .ply files: uneven in x, and with parts by their sign."""
-    from mops_lightning.data.formats.registry import WRITERS
-    from mops_lightning.data.formats.table import Table
 
     folder.mkdir(parents=True, exist_ok=True)
     random = np.random.default_rng(seed)
@@ -32,7 +31,7 @@ def write_clouds(folder, number, seed, parts=False, height=1.0):
         points = random.random((POINTS, 3)) * [3, 2, height]
         points[:, 0] **= 2
         columns = {"part": (points[:, 1] > 1).astype(np.int32)} if parts else {}
-        WRITERS[".ply"](folder / f"{place}.ply", Table(points + 1000, columns))
+        write_cloud(folder / f"{place}.ply", points + 1000, columns)
     return folder
 
 

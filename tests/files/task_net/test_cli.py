@@ -14,6 +14,8 @@ from mops_lightning.samplers.by_budget import ByBudget
 from mops_lightning.zoo.names import UNTRAINED
 from tests.files.task_net.conftest import trained, write_clouds
 from tests.support.captured import captured, done, refused
+from tests.support.cloud_files import write_cloud
+from tests.support.clouds import uniform_points
 
 NET = """
 import torch
@@ -239,11 +241,9 @@ def test_files_without_what_the_net_needs_are_refused(classifier, segmenter, sca
 
 
 def test_part_that_the_net_does_not_know_is_refused(segmenter, scans, tmp_path):
-    from mops_lightning.data.formats.registry import WRITERS
-    from mops_lightning.data.formats.table import Table
 
-    points = np.random.default_rng(0).random((100, 3))
-    WRITERS[".ply"](tmp_path / "a.ply", Table(points, {"part": np.full(100, 7, np.int32)}))
+    points = uniform_points(100, 0)
+    write_cloud(tmp_path / "a.ply", points, {"part": np.full(100, 7, np.int32)})
 
     err = refused(compare, [tmp_path / "a.ply", "--task-net", segmenter, "--m", 8])
 

@@ -8,11 +8,11 @@ import torch
 from torch import nn
 
 from mops_lightning.channels import Channel, PointChannels
-from mops_lightning.data.formats.registry import WRITERS
-from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import UserError
 from mops_lightning.files.task_net.clouds import CHECKING, CHOOSING, batches, read_sources
 from mops_lightning.files.task_net.subject import subject_of_module
+from tests.support.cloud_files import write_cloud
+from tests.support.clouds import uniform_points
 
 
 @pytest.fixture
@@ -29,7 +29,7 @@ def files(tmp_path):
             "part": np.where(is_left, 2, 5).astype(np.int32),
         }
         paths.append(tmp_path / f"{number}.ply")
-        WRITERS[".ply"](paths[-1], Table(points, columns))
+        write_cloud(paths[-1], points, columns)
     return paths
 
 
@@ -91,9 +91,7 @@ def test_halves_share_the_files_of_every_class(tmp_path):
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         for number in range(4):
-            np.save(
-                tmp_path / name / f"{number}.npy", np.random.default_rng(number).random((70, 3))
-            )
+            np.save(tmp_path / name / f"{number}.npy", uniform_points(70, number))
     files = sorted(tmp_path.rglob("*.npy"))
 
     sources = read_sources(files, subject(), 0, None)
