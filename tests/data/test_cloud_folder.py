@@ -10,10 +10,9 @@ from torch.testing import assert_close
 from trimesh.creation import box
 
 from mops_lightning.data import cloud_folder as module
-from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import UserError
-from tests.support.cloud_files import write_cloud, write_table
-from tests.support.clouds import normal_points
+from tests.support.cloud_files import write_cloud
+from tests.support.clouds import normal_points, uniform_points
 from tests.support.meshes import write_mesh
 
 cloud_folder = partial(module.cloud_folder, test_frames=None, crop="nearest", crops=32)
@@ -98,9 +97,10 @@ def test_cloud_folder_columns_name_those_of_bin_files(tmp_path):
     constant_first = np.insert(xyz, 0, 7.0, axis=1)
     folder = tmp_path / "points"
     folder.mkdir()
+    in_float64 = xyz.astype(np.float64)
     for name in ("a", "b"):
         constant_first.tofile(folder / f"{name}_named.bin")
-        write_cloud(folder / f"{name}.ply", xyz.astype(np.float64))
+        write_cloud(folder / f"{name}.ply", in_float64)
 
     data = cloud_folder(
         tmp_path,
@@ -135,20 +135,129 @@ def test_cloud_folder_folders_are_classes_and_splits(tmp_path):
 
 
 def test_cloud_folder_broken_file_is_named(folder):
-    (folder / "notes.txt").write_text("scanned on Monday\n")
+    notes = folder / "notes.txt"
+    notes.write_text("scanned on Monday\n")
+
     with pytest.raises(UserError, match=r"notes\.txt"):
         cloud_folder(folder, n_points=64)
-    (folder / "notes.txt").unlink()
+    notes.unlink()
     write(folder / "small.ply", number=10)
     with pytest.raises(UserError, match=r"small\.ply has 10 points, fewer .*or remove the file"):
         cloud_folder(folder, n_points=64)
 
 
-def test_cloud_folder_class_in_one_split_is_reported(mesh_layout, capsys):
-    (mesh_layout / "ball" / "test" / "ball_3.OFF").unlink()
+@pytest.mark.parametrize(
+    ("file", "split", "consequence"),
+    [
+        ("ball/test/ball_3.OFF", "test", "never scored"),
+        ("ball/train/ball_1.off", "train", "never learned"),
+    ],
+)
+def test_cloud_folder_class_in_one_split_is_reported(file, split, consequence, mesh_layout, capsys):
+    (mesh_layout / file).unlink()
+
     data = cloud_folder(mesh_layout, n_points=20, crop="surface", crops=1)
-    assert data.notes["classes_without_test_files"] == ["ball"]
-    assert "no test file of ball: never scored" in capsys.readouterr().err
+
+    assert data.notes[f"classes_without_{split}_files"] == ["ball"]
+    assert f"no {split} file of ball: {consequence}" in capsys.readouterr().err
+
+
+def test_cloud_folder_without_a_test_file_is_refused(tmp_path):
+    write(tmp_path / "alone.ply")
+
+    with pytest.raises(UserError, match="has no test file of cloud: give at least two files"):
+        cloud_folder(tmp_path, n_points=64)
+
+
+def test_cloud_folder_leaves_out_points_that_are_not_finite(tmp_path):
+    points = normal_points(100, 0)
+    points[::2] = np.nan
+    rows = np.arange(100)
+    for name in ("a", "b"):
+        write_cloud(tmp_path / f"{name}.ply", points, {"row": rows})
+
+    data = cloud_folder(tmp_path, n_points=50, crop="whole", crops=1, label="row")
+
+    assert torch.isfinite(all_clouds(data)).all()
+    assert data.train.parts is not None
+    odd_rows = tuple(str(row) for row in range(1, 100, 2))
+    assert data.part_names == odd_rows
+    found = data.train.parts.sort().values
+    assert found.tolist() == [list(range(50))]
+
+
+def test_cloud_folder_crops_depend_on_the_seed_and_on_the_file(tmp_path):
+    """Both files hold the same points and are in folders of the splits."""
+    for split in ("train", "test"):
+        write(tmp_path / split / f"{split}.ply")
+    settings = {"n_points": 50, "crop": "whole", "crops": 1}
+
+    data = cloud_folder(tmp_path, **settings)
+    other = cloud_folder(tmp_path, **settings, seed=1)
+
+    assert not torch.equal(data.train.points, data.test.points)
+    assert not torch.equal(data.train.points, other.train.points)
+    assert not torch.equal(data.test.points, other.test.points)
+
+
+def test_cloud_folder_folders_of_splits_come_before_the_share(tmp_path):
+    for number in range(4):
+        write(tmp_path / "train" / f"{number}.ply", number)
+    write(tmp_path / "test" / "single.ply", 9)
+
+    data = cloud_folder(tmp_path, n_points=20, crops=1, test_share=0.5)
+
+    assert data.notes == {"train_files": 4, "test_files": 1}
+
+
+def test_cloud_folder_part_zero_is_known_and_negative_numbers_are_not(tmp_path):
+    points = normal_points(40, 0)
+    numbers = np.repeat([-3, 0, 4, 9], 10)
+    for name in ("a", "b"):
+        write_cloud(tmp_path / f"{name}.ply", points, {"kind": numbers})
+
+    data = cloud_folder(tmp_path, n_points=40, crop="nearest", crops=1, label="kind")
+
+    assert data.part_names == ("0", "4", "9")
+    for clouds in (data.train, data.test):
+        assert clouds.parts is not None
+        expected = np.repeat([-1, 0, 1, 2], 10)
+        assert clouds.parts.tolist() == [expected.tolist()]
+
+
+def test_cloud_folder_part_numbers_belong_to_the_drawn_points(tmp_path):
+    points = normal_points(90, 0)
+    side = (points[:, 0] > 0).astype(int)
+    for name in ("a", "b"):
+        write_cloud(tmp_path / f"{name}.ply", points, {"side": side})
+
+    data = cloud_folder(tmp_path, n_points=40, crop="whole", crops=1, label="side")
+
+    for clouds in (data.train, data.test):
+        is_right = clouds.parts[0] == 1
+        x = clouds.points[0, :, 0]
+        assert x[is_right].min() > x[~is_right].max()
+
+
+@pytest.mark.parametrize(
+    ("n_points", "length"),
+    [
+        (500, 2),  # a twentieth of 10,000 points
+        (2000, 5),  # an eighth of 16,000 points
+    ],
+)
+def test_cloud_folder_crop_of_a_mesh_is_at_most_an_eighth_of_its_surface(
+    n_points, length, tmp_path
+):
+    plate = box((40, 1, 0.001))
+    for name in ("a", "b"):
+        write_mesh(tmp_path / f"{name}.stl", plate)
+
+    data = cloud_folder(tmp_path, n_points=n_points, crops=1)
+
+    for cloud in all_clouds(data).numpy():
+        extent = np.ptp(cloud, axis=0)
+        assert extent[0] / extent[1] == pytest.approx(length, rel=0.15)
 
 
 def test_cloud_folder_surface_reads_modelnet_layout(mesh_layout, capsys):
@@ -196,7 +305,8 @@ def frames_of(clouds, label):
     points = clouds.points[clouds.labels == label]
     size = points.amax(1) - points.amin(1)
     lengths = size[:, 2] / size[:, 0]
-    return sorted((lengths - 1).round().int().tolist())
+    frames = (lengths - 1).round().int()
+    return sorted(frames.tolist())
 
 
 def test_cloud_folder_splits_sequences_by_time(tmp_path):
@@ -208,7 +318,13 @@ def test_cloud_folder_splits_sequences_by_time(tmp_path):
         (tmp_path / name / "notes.txt").write_text("no mesh")
 
     data = cloud_folder(
-        tmp_path, 3000, crop="surface", crops=1, test_frames="last", test_share=0.25, gap=2
+        tmp_path,
+        n_points=3000,
+        crop="surface",
+        crops=1,
+        test_frames="last",
+        test_share=0.25,
+        gap=2,
     )
 
     assert data.class_names == ("crane", "samba")
@@ -220,7 +336,9 @@ def test_cloud_folder_splits_sequences_by_time(tmp_path):
 
 def test_cloud_folder_real_sequences(real_data):
     root = real_data("vlasic2008")
+
     data = cloud_folder(root, 64, test_frames="last", gap=2, crop="surface", crops=1)
+
     assert data.class_names == ("crane", "samba")
     assert len(data.test.labels) == 24
     assert len(data.train.labels) == 2 * (59 - 12 - 2)
@@ -232,14 +350,17 @@ def test_cloud_folder_real_sequences(real_data):
         ({"crop": "near"}, "crop: unknown 'near'.*'nearest'"),
         ({"crop": "surface"}, "crops must be 1 with crop=surface, got 32"),
         ({"test_share": 1.0}, "test_share must be between 0 and 1, got 1.0"),
+        ({"test_share": 0.0}, "test_share must be between 0 and 1, got 0.0"),
         ({"test_frames": "lats"}, "test_frames must be last or null, got 'lats'"),
         ({"crops": 0}, "crops must be at least 1"),
         ({"n_points": 0}, "n_points must be at least 2, got 0"),
+        ({"n_points": 1}, "n_points must be at least 2, got 1"),
         ({"gap": -1}, "gap must be at least 0, got -1"),
         ({"seed": -1}, "seed must be at least 0, got -1"),
         ({"columns": ["x", "y"]}, "columns must name all columns of a .bin file.*got 'x,y'"),
         ({"columns": "x,y,z"}, "columns must name all columns.*got 'x,y,z'"),
         ({"columns": list("xyz"), "crop": "surface", "crops": 1}, "columns must be null with"),
+        ({"label": "part", "crop": "surface", "crops": 1}, "label must be null with"),
         ({"classes": ["clod"]}, "classes: unknown class 'clod'.*cloud"),
     ],
 )
@@ -257,14 +378,11 @@ def test_cloud_folder_without_cloud_raises(tmp_path):
 
 def test_cloud_folder_tiles_score_every_labelled_point_of_a_file_once(tmp_path):
     for seed, number in enumerate((300, 500, 700)):
-        points = np.random.default_rng(seed).uniform(0, [40, 30, 2], (number, 3))
+        points = uniform_points(number, seed) * [40, 30, 2]
         classes = np.where(points[:, 2] < 1, 2, 5)
-        table = Table(points, {"classification": classes})
-        write_table(tmp_path / f"{seed}.ply", table)
+        write_cloud(tmp_path / f"{seed}.ply", points, {"classification": classes})
 
-    data = module.cloud_folder(
-        tmp_path, 128, test_frames=None, crop="tiles", crops=None, label="classification"
-    )
+    data = cloud_folder(tmp_path, 128, crop="tiles", crops=None, label="classification")
 
     counts = []
     for clouds in (data.train, data.test):
@@ -283,4 +401,4 @@ def test_cloud_folder_number_of_tiles_is_refused(tmp_path):
     write(tmp_path / "scan.ply")
 
     with pytest.raises(UserError, match="crops must be null with crop=tiles"):
-        module.cloud_folder(tmp_path, 64, test_frames=None, crop="tiles", crops=3)
+        cloud_folder(tmp_path, 64, crop="tiles", crops=3)

@@ -353,6 +353,30 @@ def test_added_points_are_where_they_should_be(clouds):
     assert to_cloud.mean() < 0.2
 
 
+def test_background_has_the_share_of_its_severity():
+    points = torch.rand(1, 5040, 3)
+    cloud = Clouds(points, torch.zeros(1, dtype=torch.long))
+
+    added = []
+    for severity in range(1, 6):
+        corrupted = corrupt(cloud, f"background-{severity}")
+        added.append(corrupted.points.shape[1] - 5040)
+
+    assert added == [112, 126, 144, 168, 252]
+
+
+def test_global_points_are_uniform_in_the_ball():
+    points = torch.zeros(1, 20_000, 3)
+    many = Clouds(points, torch.zeros(1, dtype=torch.long))
+
+    added = corrupt(many, "add_global-5").points[0, 20_000:]
+
+    volumes = added.norm(dim=1).pow(3)
+    shares, _ = torch.histogram(volumes, 4, range=(0, 1))
+    assert len(added) == 1000
+    assert (shares / 1000).tolist() == pytest.approx([0.25] * 4, abs=0.05)
+
+
 def test_local_points_are_added_at_distances_of_about_a_tenth():
     """Around one place: the standard deviation is from 0.075 to 0.125 along every axis."""
     points = torch.zeros(20, N, 3)

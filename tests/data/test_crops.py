@@ -14,11 +14,12 @@ FAR = np.array([431_000.0, 5_412_000.0, 120.0])
 
 
 def cloud(number=2000, side=10.0):
-    return np.random.default_rng(0).uniform(0, side, (number, 3)) + FAR
+    return side * uniform_points(number, 0) + FAR
 
 
 def cut(points, n_points):
-    return random_crops(points, n_points, None, "tiles", np.random.default_rng(0), PATH)
+    rng = np.random.default_rng(0)
+    return random_crops(points, n_points, None, "tiles", rng, PATH)
 
 
 def draw(points, crop="nearest", n_points=50, number=6, seed=1):
@@ -31,28 +32,60 @@ def test_random_crops_nearest_is_a_ball_around_a_point():
 
     crops = draw(points)
 
+    means = crops.mean(1)
     assert crops.shape == (6, 50, 3)
-    assert np.abs(crops.mean(1)).max() < 1e-5
-    centre = points[np.random.default_rng(1).integers(len(points))]
-    distances = np.linalg.norm(points - centre, axis=1)
+    assert np.abs(means).max() < 1e-5
+    row_of_centre = np.random.default_rng(1).integers(len(points))
+    distances = np.linalg.norm(points - points[row_of_centre], axis=1)
     radius = np.sort(distances)[49]
     near = points[distances <= radius]
-    assert np.allclose(crops[0], near - near.mean(0), atol=1e-5)
+    expected = near - near.mean(0)
+    assert np.allclose(crops[0], expected, atol=1e-5)
 
 
 def test_random_crops_whole():
     points = cloud()
 
-    whole = draw(points, "whole", n_points=1000, number=2)
+    first, second = draw(points, "whole", n_points=1000, number=2)
 
-    assert np.ptp(whole, axis=1).min() > 9
-    assert not np.array_equal(whole[0], whole[1])
-    assert len(np.unique(whole[0], axis=0)) == 1000
+    different_points = np.unique(first, axis=0)
+    assert np.ptp(first, axis=0).min() > 9
+    assert np.ptp(second, axis=0).min() > 9
+    assert not np.array_equal(first, second)
+    assert len(different_points) == 1000
 
 
 def test_random_crops_of_coincident_points_raises():
+    points = np.ones((60, 3))
+
     with pytest.raises(BadCloudError, match="the 50 points of a crop coincide"):
-        draw(np.ones((60, 3)), "whole")
+        draw(points, "whole")
+
+
+def test_random_crops_are_drawn_again_where_the_points_of_one_coincide():
+    """Nine tenths of the points are copies of one; the others differ in z alone."""
+    points = np.ones((1000, 3))
+    points[900:, 2] = np.arange(100)
+
+    crops = draw(points, "nearest", n_points=2, number=3)
+
+    for crop in crops:
+        assert crop[0, 2] != crop[1, 2]
+
+
+def test_random_crops_of_as_many_points_as_the_cloud_has_are_the_cloud():
+    points = cloud(50)
+
+    (nearest,) = draw(points, n_points=50, number=1)
+    (whole,) = draw(points, "whole", n_points=50, number=1)
+
+    expected = points - points.mean(0)
+    sorted_whole = np.sort(whole, axis=0)
+    sorted_expected = np.sort(expected, axis=0)
+    assert np.allclose(nearest, expected, atol=1e-5)
+    assert np.allclose(sorted_whole, sorted_expected, atol=1e-5)
+    with pytest.raises(BadCloudError, match=r"scan\.ply has 50 points, fewer than .*n_points=51"):
+        draw(points, n_points=51, number=1)
 
 
 def test_tiles_have_every_point_as_their_own_once():
@@ -64,8 +97,9 @@ def test_tiles_have_every_point_as_their_own_once():
     assert tiles.own is not None
     assert tiles.points.shape == (11, 96, 3)
     own_rows = tiles.rows[tiles.own]
+    means = tiles.points.mean(1)
     assert np.sort(own_rows).tolist() == list(range(1000))
-    assert abs(tiles.points.mean(1)).max() < 1e-4
+    assert abs(means).max() < 1e-4
 
 
 def test_tiles_are_filled_up_by_near_points_of_other_tiles():
@@ -80,9 +114,11 @@ def test_tiles_are_filled_up_by_near_points_of_other_tiles():
         own = points[rows[is_own]]
         others = points[rows[~is_own]]
         middle = own.mean(0)
-        radius = np.linalg.norm(own - middle, axis=1).max()
-        reach = np.linalg.norm(others - middle, axis=1).max()
-        assert reach < 1.5 * radius
+        distances = np.linalg.norm(points - middle, axis=1)
+        distances[rows[is_own]] = np.inf
+        nearest_others = np.sort(distances)[: len(others)]
+        distances_of_others = np.linalg.norm(others - middle, axis=1)
+        np.testing.assert_allclose(distances_of_others, nearest_others)
 
 
 def test_tiles_of_as_many_points_as_a_tile_are_the_whole_cloud():

@@ -23,10 +23,13 @@ def write_clouds(folder, sizes=SIZES):
     for number, size in enumerate(sizes):
         random = np.random.default_rng(number)
         points = random.uniform(-1, 1, (size, 3))
-        kind = "ball" if number % 2 else "box"
-        if kind == "ball":
+        kind = "box"
+        if number % 2:
+            kind = "ball"
             points /= np.linalg.norm(points, axis=1, keepdims=True)
-        split = "train" if number < len(sizes) // 2 else "test"
+        split = "test"
+        if number < len(sizes) // 2:
+            split = "train"
         path = folder / kind / split / f"{number}.npz"
         path.parent.mkdir(parents=True, exist_ok=True)
         part = (points[:, 2] > 0).astype("int64")
@@ -40,9 +43,8 @@ def folder(tmp_path):
 
 
 def dataset_of(folder, **arguments):
-    return cloud_folder(
-        folder, None, test_frames=None, crop="whole", crops=None, label="half", **arguments
-    )
+    settings = {"test_frames": None, "crop": "whole", "crops": None, "label": "half"}
+    return cloud_folder(folder, None, **settings, **arguments)
 
 
 def in_order(points):
@@ -64,6 +66,38 @@ def test_clouds_of_a_folder_keep_all_their_points(folder):
     found = train.points[is_box][0, :size]
     assert len(points) == size
     assert in_order(found) == in_order(expected)
+
+
+def test_clouds_of_a_folder_are_repeated_up_to_the_largest_with_their_parts(folder):
+    data = dataset_of(folder)
+
+    train = data.train
+    assert train.sizes is not None
+    assert train.parts is not None
+    assert train.points.shape == (4, 120, 3)
+    for points, parts, size in zip(train.points, train.parts, train.sizes, strict=True):
+        number = min(int(size), 120 - int(size))
+        repeated = slice(int(size), int(size) + number)
+        assert torch.equal(points[repeated], points[:number])
+        assert torch.equal(parts[repeated], parts[:number])
+
+
+def test_clouds_of_one_size_have_no_sizes(tmp_path):
+    write_clouds(tmp_path / "clouds", (50, 50, 50, 50))
+
+    data = dataset_of(tmp_path / "clouds")
+
+    assert data.train.sizes is None
+    assert data.train.points.shape == (2, 50, 3)
+
+
+def test_clouds_of_which_the_first_is_the_largest_have_sizes(tmp_path):
+    write_clouds(tmp_path / "clouds", (50, 90, 50, 50))
+
+    data = dataset_of(tmp_path / "clouds")
+
+    assert data.train.sizes is not None
+    assert sorted(data.train.sizes.tolist()) == [50, 90]
 
 
 def test_loader_without_shuffle_gives_each_cloud_with_all_its_points(folder):
@@ -128,10 +162,46 @@ def test_loader_points_depend_on_epoch_and_continue_after_a_stop(folder):
     assert not all(map(torch.equal, first, second))
 
 
+def test_loader_draws_other_points_in_every_epoch_batch_and_with_every_seed():
+    """One cloud of 90 points is always in a batch with one of 40 or 41."""
+    points = torch.rand(4, 90, 3)
+    sizes = torch.tensor([90, 40, 90, 40])
+    clouds = Clouds(points, torch.zeros(4, dtype=torch.long), sizes=sizes)
+
+    def chosen(seed=0):
+        """Return the rows that were kept of each cloud, epoch by epoch."""
+        loader = CloudLoader(clouds, 4, shuffle=True, seed=seed)
+        kept = []
+        for _ in range(2):
+            for batch in loader:
+                for row, cloud in zip(batch.rows, batch.points, strict=True):
+                    is_same = (cloud[:, None] == points[row]).all(2)
+                    kept.append((int(row), is_same.int().argmax(1).tolist()))
+        return kept
+
+    rows_of_large = [rows for cloud, rows in chosen() if cloud in (0, 2)]
+    rows_of_other_seed = [rows for cloud, rows in chosen(seed=1) if cloud in (0, 2)]
+
+    for rows in [*rows_of_large, *rows_of_other_seed]:
+        assert rows == sorted(rows)
+        assert len(rows) == 40
+    different = {tuple(rows) for rows in [*rows_of_large, *rows_of_other_seed]}
+    assert len(different) == 8
+
+
 RUN = [
-    *("task=classification", "dataset=clouds", "dataset.root=clouds", "dataset.crop=whole"),
-    *("dataset.n_points=null", "trainer=cpu", "batch_size=3", "m=8", "val_fraction=0"),
-    *("weights=null", "logger=none", "trainer.max_epochs=1"),
+    "task=classification",
+    "dataset=clouds",
+    "dataset.root=clouds",
+    "dataset.crop=whole",
+    "dataset.n_points=null",
+    "trainer=cpu",
+    "batch_size=3",
+    "m=8",
+    "val_fraction=0",
+    "weights=null",
+    "logger=none",
+    "trainer.max_epochs=1",
 ]
 
 
@@ -170,18 +240,16 @@ def test_run_scores_clouds_of_different_sizes_as_each_alone(folder, tmp_path):
             (single / name / "train" / "0.npz").write_bytes(path.read_bytes())
         (single / kind / "test").mkdir()
         (single / kind / "test" / path.name).write_bytes(path.read_bytes())
-        status, _, err = call(
-            [f"evaluate={run}", f"dataset.root={single}", f"out=alone{number}", "pictures=0"],
-            tmp_path,
-        )
+        out = f"alone{number}"
+        evaluation = [f"evaluate={run}", f"dataset.root={single}", f"out={out}", "pictures=0"]
+        status, _, err = call(evaluation, tmp_path)
         assert status == 0, err
-        (result,) = (tmp_path / f"alone{number}").rglob("result.json")
+        (result,) = (tmp_path / out).rglob("result.json")
         alone.append(read_record(result.parent).metrics)
 
-    for name in ("test/generated/accuracy", "test/completed/accuracy"):
-        assert together[name] == pytest.approx(np.mean([one[name] for one in alone]))
-    loss = "test/loss/cross_entropy"
-    assert together[loss] == pytest.approx(np.mean([one[loss] for one in alone]), rel=1e-5)
+    for name in ("test/generated/accuracy", "test/completed/accuracy", "test/loss/cross_entropy"):
+        values = [metrics[name] for metrics in alone]
+        assert together[name] == pytest.approx(np.mean(values), rel=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -202,5 +270,7 @@ def test_run_on_clouds_of_different_sizes_refuses_what_needs_one_size(
 
 
 def test_corrupt_clouds_of_different_sizes_is_refused(folder):
+    clouds = dataset_of(folder).test
+
     with pytest.raises(UserError, match="needs clouds of one size"):
-        corrupt(dataset_of(folder).test, "shear-3")
+        corrupt(clouds, "shear-3")

@@ -18,10 +18,13 @@ from tests.support.hdf5 import write_file
 def folder(tmp_path):
     rng = np.random.default_rng(0)
     for split, number in (("train", 6), ("test", 4)):
+        points = rng.normal(size=(number, 50, 3))
+        labels = np.arange(number) % 2
+        names = np.array([b"x"] * number)
         with h5py.File(tmp_path / f"{split}.h5", "w") as file:
-            file["data"] = rng.normal(size=(number, 50, 3)).astype(np.float32)
-            file["label"] = (np.arange(number) % 2).astype(np.uint8)  # ModelNet40's are (S, 1)
-            file["name"] = np.array([b"x"] * number)
+            file["data"] = points.astype(np.float32)
+            file["label"] = labels.astype(np.uint8)  # ModelNet40's are (S, 1)
+            file["name"] = names
     return tmp_path
 
 
@@ -30,8 +33,10 @@ def test_hdf5_reads_first_points(folder):
     again = hdf5(folder, n_points=20)
     other = hdf5(folder, n_points=21)
 
+    whole = hdf5(folder, n_points=50)
     with h5py.File(folder / "test.h5") as file:
         stored = torch.from_numpy(file["data"][:])
+    assert torch.equal(whole.test.points, stored)
     assert data.class_names == ("class_0", "class_1")
     assert data.train.points.shape == (6, 20, 3)
     assert torch.equal(data.test.points, stored[:, :20])
@@ -40,12 +45,23 @@ def test_hdf5_reads_first_points(folder):
 
 
 def test_hdf5_class_names_and_selection(folder):
-    (folder / "shape_names.txt").write_text("airplane\nbowl\n")
+    names = folder / "shape_names.txt"
+    names.write_text("airplane\n\n  bowl \n")
+
     data = hdf5(folder, 20, ["bowl"])
+
     assert data.class_names == ("bowl",)
     assert data.test.labels.tolist() == [0, 0]
-    (folder / "shape_names.txt").write_text("airplane\n")
+    names.write_text("airplane\n")
     with pytest.raises(UserError, match=r"labels from 0 to 0, .* lists 1 classes, got 0 to 1"):
+        hdf5(folder, 20)
+
+
+@pytest.mark.parametrize("names", ["airplane\nbowl\nairplane\n", "\n"], ids=["twice", "empty"])
+def test_hdf5_names_that_are_not_each_class_once_are_refused(names, folder):
+    (folder / "shape_names.txt").write_text(names)
+
+    with pytest.raises(UserError, match=r"shape_names\.txt must list each class once"):
         hdf5(folder, 20)
 
 
@@ -86,14 +102,25 @@ def of_shapes(number, **options):
     return {"data": points, "label": {"shape": (number,), "dtype": "u1", **options}}
 
 
+EXTERNAL = of_shapes(6, external="/etc/passwd")
+
+
+def of_labels(value):
+    """Arguments of a dataset of six equal labels."""
+    return {"label": {"data": np.full(6, value)}}
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"label": {"data": np.full(6, 2_000_000_000)}}, "labels from 0 to 9999, without shape_"),
+        (of_labels(2_000_000_000), "labels from 0 to 9999, without shape_"),
+        (of_labels(10_000), "labels from 0 to 9999, without shape_.* got 10000 to 10000"),
+        (of_labels(-1), "labels from 0 to 9999, .* got -1 to -1"),
         (of_shapes(0), "no shapes"),
         (of_shapes(10**9, chunks=True), "announces 1,000,000,000 shapes"),
-        ({"data": of_shapes(6, external="/etc/passwd")["data"]}, "'data' refers to other files"),
+        ({"data": EXTERNAL["data"]}, "'data' refers to other files"),
     ],
+    ids=["huge label", "label above the limit", "negative label", "empty", "too many", "external"],
 )
 def test_hdf5_crafted_file_raises(changes, message, folder):
     with h5py.File(folder / "train.h5", "a") as file:
@@ -115,16 +142,22 @@ def test_hdf5_data_of_another_file_raises(link, folder):
         else:
             other = h5py.ExternalLink(str(folder / "test.h5"), "/data")
             file["other"] = other
-            file["data"] = other if link == "external" else h5py.SoftLink("/other")
+            links = {"external": other, "soft": h5py.SoftLink("/other")}
+            file["data"] = links[link]
+
     with pytest.raises(UserError, match="'data' refers to other files"):
         hdf5(folder, 20)
 
 
 def test_hdf5_real_data(real_data):
-    data = hdf5(real_data("modelnet40_airplane_10000"), n_points=10_000)
+    root = real_data("modelnet40_airplane_10000")
+
+    data = hdf5(root, n_points=10_000)
+
+    radii = data.test.points.norm(dim=2)
     assert data.train.points.shape == (626, 10_000, 3)
     assert data.test.points.shape == (100, 10_000, 3)
-    assert data.test.points.norm(dim=2).max() < 1.001
+    assert radii.max() < 1.001
 
 
 def set_item(path: Path, key: str, place: Any, value: float) -> None:
@@ -134,53 +167,61 @@ def set_item(path: Path, key: str, place: Any, value: float) -> None:
 
 shaped = partial(np.zeros, dtype=np.float32)
 label = np.zeros((2, 1), dtype=np.uint8)
+CLOUDS = shaped((2, 12, 3))
+FILES: dict[str, tuple[dict[str, Any], str]] = {
+    "no data": ({"label": label}, r"no dataset 'data'; it contains \['label'\]"),
+    "no label": ({"data": CLOUDS}, "no dataset 'label'"),
+    "flat": ({"data": shaped((2, 36)), "label": label}, r"got \(2, 36\)"),
+    "scalar": ({"data": 1.0, "label": label}, r"got \(\)"),
+    "2-D": ({"data": shaped((2, 12, 2)), "label": label}, r"\(2, 12, 2\)"),
+    "counts": ({"data": shaped((3, 12, 3)), "label": label}, r"and \(2, 1\)"),
+    "two labels": ({"data": CLOUDS, "label": np.zeros((2, 2), np.uint8)}, r"and \(2, 2\)"),
+    "integers": ({"data": np.ones((2, 12, 3), int), "label": label}, "int64"),
+    "words": ({"data": CLOUDS, "label": [b"a", b"b"]}, "of integers"),
+    "overflow": ({"data": np.full((2, 12, 3), 1e300), "label": label}, "NaN or infinite"),
+}
+"""What a file contains, and what its error says."""
+
 DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "cut off": (lambda p: os.truncate(p, p.stat().st_size // 2), "is broken"),
     "empty": (lambda p: os.truncate(p, 0), "is broken"),
     "text": (lambda p: p.write_text("<html>Not found</html>"), "is broken"),
-    "no data": (
-        lambda p: write_file(p, label=label),
-        r"no dataset 'data'; it contains \['label'\]",
-    ),
-    "no label": (lambda p: write_file(p, data=shaped((2, 12, 3))), "no dataset 'label'"),
-    "flat": (lambda p: write_file(p, data=shaped((2, 36)), label=label), r"got \(2, 36\)"),
-    "scalar": (lambda p: write_file(p, data=1.0, label=label), r"got \(\)"),
-    "2-D": (lambda p: write_file(p, data=shaped((2, 12, 2)), label=label), r"\(2, 12, 2\)"),
-    "counts": (lambda p: write_file(p, data=shaped((3, 12, 3)), label=label), r"and \(2, 1\)"),
-    "integers": (lambda p: write_file(p, data=np.ones((2, 12, 3), int), label=label), "int64"),
-    "words": (lambda p: write_file(p, data=shaped((2, 12, 3)), label=[b"a", b"b"]), "of integers"),
     "class 3": (
         lambda p: set_item(p, "label", 2, 3),
         "labels from 0 to 2, .* lists 3 classes, got 0 to 3",
     ),
     "NaN": (lambda p: set_item(p, "data", (1, 2, 0), np.nan), "NaN or infinite"),
-    "overflow": (
-        lambda p: write_file(p, data=np.full((2, 12, 3), 1e300), label=label),
-        "NaN or infinite",
-    ),
     "missing": (lambda p: p.unlink(), "is missing"),
 }
+"""What happens to a good file, and what its error says."""
 
 
-@pytest.mark.parametrize("kind", DAMAGES)
+@pytest.mark.parametrize("kind", [*DAMAGES, *FILES])
 def test_read_clouds_damaged_file_raises(tmp_path: Path, kind: str) -> None:
-    damage, message = DAMAGES[kind]
     path = tmp_path / "train.h5"
-    write_file(path, data=shaped((3, 12, 3)), label=np.zeros((3, 1), np.uint8))
-    damage(path)
+    if kind in FILES:
+        datasets, message = FILES[kind]
+        write_file(path, **datasets)
+    else:
+        damage, message = DAMAGES[kind]
+        write_file(path, data=shaped((3, 12, 3)), label=np.zeros((3, 1), np.uint8))
+        damage(path)
+
     with pytest.raises(UserError, match=rf"(?s)train\.h5.*{message}"):
         read_clouds(path, 4, 3)
 
 
 def test_read_clouds_corrupted_file_raises(tmp_path: Path) -> None:
     path = tmp_path / "train.h5"
+    data = np.random.default_rng(0).random((50, 12, 3))
+    labels = np.zeros(50, dtype=np.uint8)
     with h5py.File(path, "w") as file:
-        data = np.random.default_rng(0).random((50, 12, 3))
         file.create_dataset("data", data=data, compression="gzip", fletcher32=True)
-        file.create_dataset("label", data=np.zeros(50, dtype=np.uint8))
-        offset = file["data"].id.get_chunk_info(0).byte_offset
+        file.create_dataset("label", data=labels)
+        first_chunk = file["data"].id.get_chunk_info(0)
     content = bytearray(path.read_bytes())
-    content[offset + 100] ^= 0xFF
+    content[first_chunk.byte_offset + 100] ^= 0xFF
     path.write_bytes(content)
+
     with pytest.raises(UserError, match=r"train\.h5 is broken"):
         read_clouds(path, 4, 3)

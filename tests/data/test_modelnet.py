@@ -23,7 +23,8 @@ STORED = 12
 def cloud(split, file, row):
     """Return points that identify where they are stored."""
     random = np.random.default_rng([len(split), file, row])
-    return random.uniform(-1, 1, (STORED, 3)).astype(np.float32)
+    points = random.uniform(-1, 1, (STORED, 3))
+    return points.astype(np.float32)
 
 
 @pytest.fixture
@@ -31,16 +32,18 @@ def layout(tmp_path):
     """Write the public layout with 5 shapes per file and labels 0, 1, 2, 0, 1."""
     folder = tmp_path / "data" / FOLDER
     folder.mkdir(parents=True)
-    (folder / "shape_names.txt").write_text("\n".join(NAMES) + "\n\n")
+    names = "\n".join(NAMES)
+    (folder / "shape_names.txt").write_text(f"{names}\n\n")
     label = np.array([[0], [1], [2], [0], [1]], dtype=np.uint8)
     for split, numbers in FILES.items():
         lines = []
         for number in numbers:
             name = f"ply_data_{split}{number}.h5"
-            data = np.stack([cloud(split, number, row) for row in range(5)])
-            write_file(folder / name, data=data, label=label)
+            clouds = [cloud(split, number, row) for row in range(5)]
+            write_file(folder / name, data=np.stack(clouds), label=label)
             lines.append(f"data/{FOLDER}/{name}")
-        (folder / f"{split}_files.txt").write_text("\r\n".join(lines))
+        listed = "\r\n".join(lines)
+        (folder / f"{split}_files.txt").write_text(listed)
     return folder
 
 
@@ -62,28 +65,47 @@ def test_modelnet_reads_all_shapes_in_order(split, layout):
 
 
 def test_modelnet_fingerprint_depends_on_content(layout, tmp_path):
+    def fingerprint(folder, n_points=4, classes=None):
+        return modelnet40(folder, n_points, classes).fingerprint
+
     elsewhere = shutil.copytree(layout, tmp_path / "elsewhere")
-    first = modelnet40(layout, n_points=4).fingerprint
-    assert modelnet40(elsewhere, n_points=4).fingerprint == first
-    others = {
-        modelnet40(layout, n_points=5).fingerprint,
-        modelnet40(layout, n_points=4, classes=NAMES[:2]).fingerprint,
-        modelnet40(layout, n_points=4, classes=NAMES[1:]).fingerprint,
-    }
+    first = fingerprint(layout)
+    of_copy = fingerprint(elsewhere)
+    more_points = fingerprint(layout, n_points=5)
+    first_classes = fingerprint(layout, classes=NAMES[:2])
+    last_classes = fingerprint(layout, classes=NAMES[1:])
     with h5py.File(elsewhere / "ply_data_test0.h5", "r+") as file:
         file["data"][3, 2, 1] += 1
-    others.add(modelnet40(elsewhere, n_points=4).fingerprint)
+    other_point = fingerprint(elsewhere)
     with h5py.File(elsewhere / "ply_data_train0.h5", "r+") as file:
         file["label"][0] = 1
-    others.add(modelnet40(elsewhere, n_points=4).fingerprint)
-    assert len(others | {first}) == 6
+    other_label = fingerprint(elsewhere)
+
+    assert of_copy == first
+    different = {first, more_points, first_classes, last_classes, other_point, other_label}
+    assert len(different) == 6
+
+
+def test_modelnet_lists_written_on_windows_name_the_same_files(layout):
+    dataset = modelnet40(layout, n_points=4)
+    for path in layout.glob("*_files.txt"):
+        listed = path.read_text().replace("/", "\\")
+        path.write_text(listed)
+
+    again = modelnet40(layout, n_points=4)
+
+    assert again.fingerprint == dataset.fingerprint
 
 
 def test_modelnet_missing_folder_raises(tmp_path):
+    missing = tmp_path / "none"
+
     with pytest.raises(UserError) as caught:
-        modelnet40(tmp_path / "none")
-    for words in ("root: ", str(tmp_path / "none"), "shape_names.txt", "dataset.download=true"):
-        assert words in str(caught.value)
+        modelnet40(missing)
+
+    said = str(caught.value)
+    for words in ("root: ", str(missing), "shape_names.txt", "dataset.download=true"):
+        assert words in said
 
 
 def test_modelnet_missing_lists_raise(layout):
@@ -97,9 +119,12 @@ def test_modelnet_missing_lists_raise(layout):
 
 
 def test_modelnet_class_without_shapes_raises(layout):
+    cloud = np.zeros((1, STORED, 3))
+    label = np.zeros(1, np.uint8)
     for number in FILES["test"]:
         path = layout / f"ply_data_test{number}.h5"
-        write_file(path, data=np.zeros((1, STORED, 3)), label=np.zeros(1, np.uint8))
+        write_file(path, data=cloud, label=label)
+
     with pytest.raises(UserError, match=r"^classes: .* has no test shape of chair"):
         modelnet40(layout, n_points=4, classes=["chair"])
 
@@ -109,10 +134,12 @@ def mirror(layout, tmp_path, monkeypatch):
     """The archive on the second of two mirrors, with the expected hash; what is requested."""
     shelf = str(tmp_path / "shelf" / "set")
     archive = Path(shutil.make_archive(shelf, "zip", layout.parent, FOLDER))
-    digest = hashlib.md5(archive.read_bytes()).hexdigest()
+    content = archive.read_bytes()
+    digest = hashlib.md5(content).hexdigest()
     monkeypatch.setattr(modelnet, "ARCHIVE_HASH", f"md5:{digest}")
     with served(archive.parent) as (address, requested):
-        monkeypatch.setattr(modelnet, "MIRRORS", (f"{address}/gone.zip", f"{address}/set.zip"))
+        mirrors = (f"{address}/gone.zip", f"{address}/set.zip")
+        monkeypatch.setattr(modelnet, "MIRRORS", mirrors)
         yield requested
 
 
@@ -122,7 +149,8 @@ def test_modelnet_downloads_once(layout, mirror, tmp_path, name):
     found: list[str] = []
 
     def load() -> None:
-        found.append(modelnet40(root, n_points=4, download=True).fingerprint)
+        dataset = modelnet40(root, n_points=4, download=True)
+        found.append(dataset.fingerprint)
 
     threads = [threading.Thread(target=load) for _ in range(3)]  # as a sweep would start them
     for thread in threads:
@@ -130,19 +158,28 @@ def test_modelnet_downloads_once(layout, mirror, tmp_path, name):
     for thread in threads:
         thread.join()
     load()
-    assert found == [modelnet40(layout, n_points=4).fingerprint] * 4
+
+    expected = modelnet40(layout, n_points=4).fingerprint
+    left_over = list((tmp_path / "new").rglob("*.zip*"))
+    assert found == [expected] * 4
     assert mirror == ["/gone.zip", "/set.zip"]
-    assert not list((tmp_path / "new").rglob("*.zip*"))
+    assert not left_over
 
 
 def test_modelnet_wrong_hash_or_unwritable_root_raises(mirror, tmp_path, monkeypatch):
-    monkeypatch.setattr(modelnet, "ARCHIVE_HASH", "md5:" + "0" * 32)
+    zeros = "0" * 32
+    monkeypatch.setattr(modelnet, "ARCHIVE_HASH", f"md5:{zeros}")
+    new = tmp_path / "new"
+    file = tmp_path / "file"
+    file.touch()
+
     with pytest.raises(UserError, match=r"gone\.zip: .*404.*set\.zip: .*hash.*save the file as"):
-        modelnet40(tmp_path / "new", download=True)
-    assert not list((tmp_path / "new").rglob("*.zip"))
-    (tmp_path / "file").touch()
+        modelnet40(new, download=True)
     with pytest.raises(UserError, match=r"Cannot download ModelNet40 into"):
-        modelnet40(tmp_path / "file" / "data", download=True)
+        modelnet40(file / "data", download=True)
+
+    left_over = list(new.rglob("*.zip"))
+    assert not left_over
 
 
 def test_modelnet_in_the_folder_above_is_the_same(layout):
@@ -154,7 +191,9 @@ def test_modelnet_in_the_folder_above_is_the_same(layout):
 
 
 def test_modelnet_real_data(real_data):
-    dataset = modelnet40(real_data("modelnet40_hdf5_1024"))
+    root = real_data("modelnet40_hdf5_1024")
+
+    dataset = modelnet40(root)
 
     train = dataset.train
     test = dataset.test

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from mops_lightning.data.procedural import sampled
 from mops_lightning.data.procedural.mesh_parts import join, turned
 from mops_lightning.data.procedural.sampled import BUILDERS
-from mops_lightning.data.shapes import ASYMMETRIC, CLASSES, shapes
+from mops_lightning.data.shapes import ASYMMETRIC, CLASSES, PARTS, shapes
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import TEMPORARY
 
@@ -28,13 +28,14 @@ def dataset():
 
 
 def same(first, second):
-    return (
-        torch.equal(first.train.points, second.train.points)
-        and torch.equal(first.train.labels, second.train.labels)
-        and torch.equal(first.test.points, second.test.points)
-        and torch.equal(first.test.labels, second.test.labels)
-        and first.fingerprint == second.fingerprint
-    )
+    for split in ("train", "test"):
+        clouds = getattr(first, split)
+        others = getattr(second, split)
+        if not torch.equal(clouds.points, others.points):
+            return False
+        if not torch.equal(clouds.labels, others.labels):
+            return False
+    return first.fingerprint == second.fingerprint
 
 
 # Content
@@ -50,8 +51,9 @@ def test_shapes_are_labelled_and_in_unit_sphere(split, count, dataset):
     assert clouds.labels.dtype == torch.int64
     assert clouds.labels.bincount().tolist() == [count] * number
     largest = clouds.points.norm(dim=-1).amax(1)
+    means = clouds.points.mean(1)
     assert torch.allclose(largest, torch.ones(()), atol=1e-6)
-    assert clouds.points.mean(1).abs().max() < 1e-6
+    assert means.abs().max() < 1e-6
 
 
 def test_shapes_have_a_class_for_each_builder(dataset):
@@ -73,46 +75,100 @@ def test_shapes_points_are_uniform_by_area(monkeypatch):
 
     points = shapes(40_000, 1, 1, ["bottle"]).train.points[0]
 
-    above_floor = points[:, 1].double() - points[:, 1].double().min()
-    height = 2 * (above_floor / above_floor.max()).numpy()
+    y = points[:, 1].double().numpy()
+    height = 2 * (y - y.min()) / np.ptp(y)
     is_floor = height < 1e-6
     assert is_floor.mean() == pytest.approx(1 / 5, abs=0.01)
     wall = height[~is_floor]
     counts, _ = np.histogram(wall, 4, (0, 2))
-    assert counts / len(wall) == pytest.approx([0.25, 0.25, 0.25, 0.25], abs=0.02)
+    shares = counts / len(wall)
+    assert shares == pytest.approx([0.25, 0.25, 0.25, 0.25], abs=0.02)
 
 
 def test_shapes_many_points_and_single_point():
     many = shapes(100_000, 1, 1, ["teapot"])
+    single = shapes(1, 1, 1, ["teapot"])
+
     assert many.train.points.shape == (1, 100_000, 3)
-    one = shapes(1, 1, 1, ["teapot"])
-    assert torch.equal(one.train.points, torch.zeros(1, 1, 3))
+    assert torch.equal(single.train.points, torch.zeros(1, 1, 3))
+
+
+def test_shapes_parts_are_named_where_they_are():
+    data = shapes(400, 3, 2, ["table", "airplane"])
+
+    assert data.class_names == ("airplane", "table")
+    assert data.part_names == ("hull", "wing", "tail", "engine", "top", "leg")
+    for clouds, count in ((data.train, 3), (data.test, 2)):
+        assert clouds.parts is not None
+        assert clouds.parts.shape == (2 * count, 400)
+        airplanes = clouds.parts[:count]
+        tables = clouds.parts[count:]
+        assert airplanes.unique().tolist() == [0, 1, 2, 3]
+        assert tables.unique().tolist() == [4, 5]
+        for points, parts in zip(clouds.points[count:], tables, strict=True):
+            height = points[:, 1]
+            assert height[parts == 4].mean() > height[parts == 5].mean() + 0.1
+        for points, parts in zip(clouds.points, airplanes, strict=False):
+            side = points[:, 0].abs()
+            assert side[parts == 1].max() > 2 * side[parts == 0].max()
+
+
+def test_shapes_have_no_parts_where_a_class_does_not_know_them():
+    data = shapes(8, 1, 1, ["bowl", "table"])
+
+    assert data.part_names == ()
+    assert data.train.parts is None
+    assert data.test.parts is None
+
+
+def test_shapes_keep_the_fingerprint_of_published_task_nets():
+    """Models and cached task nets were trained on these shapes; new ones need a new version."""
+    data = shapes(16, 1, 1, ["cup"])
+
+    first_point = data.train.points[0, 0].tolist()
+    assert first_point == pytest.approx([-0.014166577, -0.312007785, 0.099837191], abs=1e-5)
+    assert data.fingerprint[:12] == "62c97b4dc570"
 
 
 # Reproducibility
 
 
 def test_shapes_depend_on_seed():
-    assert same(shapes(**SMALL), shapes(**SMALL))
+    first = shapes(**SMALL)
+    again = shapes(**SMALL)
     other = shapes(**SMALL, seed=1)
-    assert not torch.equal(other.train.points, shapes(**SMALL).train.points)
+
+    assert same(first, again)
+    assert not torch.equal(other.train.points, first.train.points)
 
 
 def test_shapes_are_independent_of_counts():
     few = shapes(**SMALL)
     more = shapes(64, 5, 3, ["bowl", "cup", "stool", "vase"])
     for split in ("train", "test"):
-        small = getattr(few, split)
-        large = getattr(more, split)
         for name in few.class_names:
-            expected = small.points[small.labels == few.class_names.index(name)]
-            found = large.points[large.labels == more.class_names.index(name)]
-            assert torch.equal(found[: len(expected)], expected)
+            expected = clouds_of_class(few, split, name)
+            found = clouds_of_class(more, split, name)
+            number = len(expected)
+            assert torch.equal(found[:number], expected)
+
+
+def clouds_of_class(data, split, name):
+    clouds = getattr(data, split)
+    label = data.class_names.index(name)
+    return clouds.points[clouds.labels == label]
+
+
+def extents_of(clouds):
+    return clouds.points.amax(1) - clouds.points.amin(1)
 
 
 def test_shapes_differ_within_class_and_between_splits(dataset):
-    extents = torch.cat([_extents(dataset.train), _extents(dataset.test)])
-    assert len(extents.unique(dim=0)) == len(extents)
+    of_train = extents_of(dataset.train)
+    of_test = extents_of(dataset.test)
+    extents = torch.cat([of_train, of_test])
+    different = extents.unique(dim=0)
+    assert len(different) == len(extents)
 
 
 def median_distance(points, others):
@@ -134,10 +190,14 @@ def test_shapes_form_is_independent_of_n_points():
 
 def test_shapes_keep_global_random_state():
     def states():
-        return str(np.random.get_state(legacy=False)), torch.get_rng_state().tolist()  # noqa: NPY002
+        of_numpy = str(np.random.get_state(legacy=False))  # noqa: NPY002
+        of_torch = torch.get_rng_state().tolist()
+        return of_numpy, of_torch
 
     before = states()
+
     shapes(**SMALL)
+
     assert states() == before
 
 
@@ -150,17 +210,16 @@ def test_shapes_fingerprint_depends_on_arguments():
         {"classes": ["cup", "vase"]},
         {"seed": 1},
     ]
-    prints = [shapes(**{**SMALL, **variant}).fingerprint for variant in variants]
+    other_order = {**SMALL, "classes": ["stool", "cup"]}
+
+    prints = []
+    for variant in variants:
+        arguments = {**SMALL, **variant}
+        prints.append(shapes(**arguments).fingerprint)
+
     assert len(set(prints)) == len(variants)
-    assert all(len(text) == 64 for text in prints)
-    assert shapes(**{**SMALL, "classes": ["stool", "cup"]}).fingerprint == prints[0]
-
-
-# Difficulty
-
-
-def _extents(clouds):
-    return clouds.points.amax(1) - clouds.points.amin(1)
+    assert {len(text) for text in prints} == {64}
+    assert shapes(**other_order).fingerprint == prints[0]
 
 
 # Cache
@@ -168,34 +227,46 @@ def _extents(clouds):
 
 def test_shapes_cache_is_written_and_read(tmp_path):
     fresh = shapes(**SMALL)
-    assert same(shapes(**SMALL, cache=tmp_path / "new"), fresh)
-    (path,) = (tmp_path / "new").iterdir()
+    cache = tmp_path / "new"
+    written = shapes(**SMALL, cache=cache)
+    (path,) = cache.iterdir()
     # Changed clouds in the file are returned, so it is read.
     train = fresh.train
     test = fresh.test
+    half = train.points / 2
     parts: list[Any] = [train.parts, test.parts]
-    np.savez(path, train.points / 2, test.points, *parts)
-    again = shapes(**SMALL, cache=str(tmp_path / "new"))
-    assert torch.equal(again.train.points, fresh.train.points / 2)
-    assert torch.equal(again.train.labels, fresh.train.labels)
+    np.savez(path, half, test.points, *parts)
+
+    again = shapes(**SMALL, cache=str(cache))
+
+    assert same(written, fresh)
+    assert torch.equal(again.train.points, half)
+    assert torch.equal(again.train.labels, train.labels)
+    assert torch.equal(again.test.parts, test.parts)
 
 
 def test_shapes_damaged_cache_or_one_of_other_shapes_is_replaced(tmp_path):
     fresh = shapes(**SMALL, cache=tmp_path)
     (path,) = tmp_path.iterdir()
     whole = path.read_bytes()
-    damaged = [b"", b"not an archive", whole[: len(whole) // 2], whole[:-1], b"\x93NUMPY" + whole]
+    half = len(whole) // 2
+    damaged = [
+        b"",
+        b"not an archive",
+        whole[:half],
+        whole[:-1],
+        b"\x93NUMPY" + whole,
+    ]
     for position in range(0, len(whole), len(whole) // 20):
         flipped = bytearray(whole)
         flipped[position] ^= 0xFF
         damaged.append(bytes(flipped))
-    right = np.zeros((2, 64, 3), np.float32)
-    for arrays in (
-        {"train": np.zeros((4, 64, 3), np.float32)},
-        {"train": np.zeros((4, 64, 3)), "test": right},
-        {"train": np.zeros((3, 64, 3), np.float32), "test": right},
-        {"train": np.array([{}], object), "test": right},
-    ):
+    test = np.zeros((2, 64, 3), np.float32)
+    without_test = {"train": np.zeros((4, 64, 3), np.float32)}
+    in_float64 = {"train": np.zeros((4, 64, 3)), "test": test}
+    too_few = {"train": np.zeros((3, 64, 3), np.float32), "test": test}
+    objects = {"train": np.array([{}], object), "test": test}
+    for arrays in (without_test, in_float64, too_few, objects):
         np.savez(path, **arrays)
         damaged.append(path.read_bytes())
     for content in damaged:
@@ -227,20 +298,25 @@ def test_shapes_damaged_cache_or_one_of_other_shapes_is_replaced(tmp_path):
     ],
 )
 def test_shapes_invalid_argument_raises(name, value):
+    arguments = {**SMALL, name: value}
+
     with pytest.raises(UserError, match=rf"^{name}\b.*"):
-        shapes(**{**SMALL, name: value})
+        shapes(**arguments)
 
 
 def test_shapes_unwritable_cache_raises(tmp_path):
-    (tmp_path / "file").write_text("")
-    for cache in (tmp_path / "file", tmp_path / "file" / "below"):
+    file = tmp_path / "file"
+    file.write_text("")
+    for cache in (file, file / "below"):
         with pytest.raises(UserError, match=r"^cache\b.*file"):
             shapes(**SMALL, cache=cache)
 
 
 def test_shapes_print_nothing_without_terminal(capfd, monkeypatch):
     monkeypatch.setenv("FORCE_COLOR", "1")
+
     shapes(**SMALL)
+
     assert capfd.readouterr() == ("", "")
 
 
@@ -256,12 +332,17 @@ def test_builder_gives_valid_meshes(name):
 
 def test_asymmetric_classes_are_a_choice_of_their_own():
     few: dict[str, Any] = {"n_points": 8, "train_per_class": 1, "test_per_class": 1}
-    assert shapes(**few, classes="asymmetric").class_names == ASYMMETRIC
+
+    asymmetric = shapes(**few, classes="asymmetric")
+    with_parts = shapes(**few, classes="parts")
+
+    assert asymmetric.class_names == ASYMMETRIC
+    assert with_parts.class_names == tuple(PARTS)
 
 
 def test_shapes_nearest_bounding_boxes_do_not_identify_classes(dataset):
-    train = _extents(dataset.train).double()
-    test = _extents(dataset.test).double()
+    train = extents_of(dataset.train).double()
+    test = extents_of(dataset.test).double()
 
     _, nearest = cKDTree(train.numpy()).query(test.numpy())
 
@@ -275,8 +356,8 @@ def quadratic_terms(sizes):
 
 
 def test_shapes_quadratic_forms_of_bounding_boxes_do_not_identify_classes(dataset):
-    train = quadratic_terms(_extents(dataset.train).double())
-    test = quadratic_terms(_extents(dataset.test).double())
+    train = quadratic_terms(extents_of(dataset.train).double())
+    test = quadratic_terms(extents_of(dataset.test).double())
     targets = torch.nn.functional.one_hot(dataset.train.labels).double()
 
     weights = torch.linalg.lstsq(train, targets).solution

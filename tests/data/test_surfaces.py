@@ -45,8 +45,7 @@ def test_sample_surface_is_uniform_by_area(tmp_path):
 
 
 def test_sampling_cloud_depends_on_content_and_seed(mesh_layout, tmp_path):
-    elsewhere = tmp_path / "elsewhere"
-    shutil.copytree(mesh_layout, elsewhere)
+    elsewhere = shutil.copytree(mesh_layout, tmp_path / "elsewhere")
     write_mesh(elsewhere / "ball" / "train" / "ball_0.off", BALL)
     state = repr(np.random.get_state())  # noqa: NPY002
 
@@ -64,20 +63,24 @@ def test_sampling_cloud_depends_on_content_and_seed(mesh_layout, tmp_path):
 
 
 def test_sampling_fingerprint_depends_on_content_names_and_arguments(mesh_layout, tmp_path):
-    first = meshes(mesh_layout, n_points=20).fingerprint
+    def fingerprint(folder, n_points=20, **more):
+        return meshes(folder, n_points=n_points, **more).fingerprint
+
     elsewhere = shutil.copytree(mesh_layout, tmp_path / "elsewhere")
-    assert meshes(elsewhere, n_points=20, cache=tmp_path / "cache").fingerprint == first
-    prints = {
-        first,
-        meshes(mesh_layout, n_points=21).fingerprint,
-        meshes(mesh_layout, n_points=20, seed=1).fingerprint,
-        meshes(mesh_layout, n_points=20, classes=["box"]).fingerprint,
-    }
-    (elsewhere / "box" / "train" / "box_1.off").rename(elsewhere / "box" / "train" / "new.off")
-    prints.add(meshes(elsewhere, n_points=20).fingerprint)
-    write_mesh(elsewhere / "box" / "train" / "new.off", BALL)
-    prints.add(meshes(elsewhere, n_points=20).fingerprint)
-    assert len(prints) == 6
+    boxes = elsewhere / "box" / "train"
+    first = fingerprint(mesh_layout)
+    of_copy = fingerprint(elsewhere, cache=tmp_path / "cache")
+    more_points = fingerprint(mesh_layout, n_points=21)
+    other_seed = fingerprint(mesh_layout, seed=1)
+    one_class = fingerprint(mesh_layout, classes=["box"])
+    (boxes / "box_1.off").rename(boxes / "new.off")
+    other_name = fingerprint(elsewhere)
+    write_mesh(boxes / "new.off", BALL)
+    other_content = fingerprint(elsewhere)
+
+    assert of_copy == first
+    different = {first, more_points, other_seed, one_class, other_name, other_content}
+    assert len(different) == 6
 
 
 def add_one(path):
