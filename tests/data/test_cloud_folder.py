@@ -1,6 +1,7 @@
 import math
 from collections import Counter
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -190,7 +191,7 @@ def test_cloud_folder_crops_depend_on_the_seed_and_on_the_file(tmp_path):
     """Both files hold the same points and are in folders of the splits."""
     for split in ("train", "test"):
         write(tmp_path / split / f"{split}.ply")
-    settings = {"n_points": 50, "crop": "whole", "crops": 1}
+    settings: dict[str, Any] = {"n_points": 50, "crop": "whole", "crops": 1}
 
     data = cloud_folder(tmp_path, **settings)
     other = cloud_folder(tmp_path, **settings, seed=1)
@@ -234,6 +235,7 @@ def test_cloud_folder_part_numbers_belong_to_the_drawn_points(tmp_path):
     data = cloud_folder(tmp_path, n_points=40, crop="whole", crops=1, label="side")
 
     for clouds in (data.train, data.test):
+        assert clouds.parts is not None
         is_right = clouds.parts[0] == 1
         x = clouds.points[0, :, 0]
         assert x[is_right].min() > x[~is_right].max()

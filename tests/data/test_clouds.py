@@ -1,4 +1,5 @@
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -181,6 +182,9 @@ def test_smallest_and_rows_of_clouds_of_different_sizes():
     assert clouds.smallest == (1, 6)
     assert taken.smallest == (1, 6)
     assert clouds._replace(sizes=None).smallest == (0, 9)
+    assert taken.sources is not None
+    assert taken.parts is not None
+    assert taken.sizes is not None
     assert taken.sources.tolist() == [5, 4]
     assert taken.parts[:, 0].tolist() == [18, 9]
     assert taken.sizes.tolist() == [8, 6]
@@ -197,7 +201,7 @@ def made(**changes):
         parts=torch.zeros(2, 4, dtype=torch.long),
         sizes=torch.tensor([4, 3]),
     )
-    arguments = {
+    arguments: dict[str, Any] = {
         "kind": "kind",
         "known": ("a", "b"),
         "classes": None,

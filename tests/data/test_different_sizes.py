@@ -1,5 +1,7 @@
 """Clouds of different sizes: from a folder to batches, and scores as of each cloud alone."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -43,7 +45,12 @@ def folder(tmp_path):
 
 
 def dataset_of(folder, **arguments):
-    settings = {"test_frames": None, "crop": "whole", "crops": None, "label": "half"}
+    settings: dict[str, Any] = {
+        "test_frames": None,
+        "crop": "whole",
+        "crops": None,
+        "label": "half",
+    }
     return cloud_folder(folder, None, **settings, **arguments)
 
 
