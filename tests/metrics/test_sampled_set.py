@@ -39,6 +39,19 @@ def test_subset_distance_matches_kd_tree(clouds, randn):
     assert found.tolist() == pytest.approx(expected, rel=1e-5)
 
 
+def test_subset_distance_is_between_coordinates(clouds, randn):
+    samples = randn(3, 7, 3)
+    with_channels = torch.cat([clouds, 9 * randn(3, 40, 2)], 2)
+    samples_with_channels = torch.cat([samples, 9 * randn(3, 7, 2)], 2)
+
+    found = values(
+        "generated/subset_distance", with_channels, SampleOutput(samples_with_channels, None, {})
+    )
+
+    expected = values("generated/subset_distance", clouds, SampleOutput(samples, None, {}))
+    assert_close(found, expected)
+
+
 def test_unique_points_counts_each_match_once(clouds):
     near = clouds[:, 9] + 1e-4
     samples = torch.stack([clouds[:, 4], clouds[:, 4], near], 1)

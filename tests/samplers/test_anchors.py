@@ -1,5 +1,7 @@
 """MOPS-Net with anchors against farthest points and a dense softmax of distances."""
 
+import math
+
 import pytest
 import torch
 from torch.testing import assert_close
@@ -185,6 +187,19 @@ def test_anchors_refuse_chunks(randn):
 
     with pytest.raises(UserError, match=r"needs all points .* chunks.*without anchors=fps"):
         stream_sample(net, lambda: points.split(20))
+
+
+def test_columns_of_coincident_points_have_a_least_width():
+    points = torch.zeros(1, 80, 3)
+    points[0, 40:, 0] = 0.002  # two places, 40 points each
+    net = small(m=2, tau_min=1.0).double().eval()
+
+    (generated,) = net(points.double()).points
+
+    # Weights fall off by exp(−d²/s²) with s = 0.001.
+    share_of_other_place = math.exp(-4) / (1 + math.exp(-4))
+    expected = [0.002 * share_of_other_place, 0.002 * (1 - share_of_other_place)]
+    assert sorted(generated[:, 0].tolist()) == pytest.approx(expected, rel=1e-4)
 
 
 def median_width(net, points):

@@ -26,7 +26,7 @@ from mops_lightning import (
 )
 from mops_lightning.channels import Channel, PointChannels
 from mops_lightning.errors import UserError
-from mops_lightning.losses.subset import subset_losses
+from mops_lightning.losses.subset import simplification_losses, subset_losses
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.base import stream_sample
@@ -147,6 +147,17 @@ def test_points_without_a_matrix_have_the_channels_of_the_nearest_point(name, cl
     _, rows = nearest(sampled[..., :3], clouds[..., :3])
     nearest_points = gather_points(clouds, rows)
     assert torch.equal(sampled[..., 3:], nearest_points[..., 3:])
+
+
+def test_simplification_loss_is_between_coordinates(clouds):
+    sampler: Any = LEARNED["snet"](CHANNELS)
+
+    output = sampler(clouds)
+
+    places = clouds[..., :3].contiguous()
+    generated = output.points[..., :3].contiguous()
+    expected = simplification_losses(places, generated, [M])
+    assert_close(output.losses["simplification"], sampler.alpha * expected[M])
 
 
 def test_subset_loss_is_between_coordinates(clouds):

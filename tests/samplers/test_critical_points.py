@@ -28,12 +28,12 @@ def test_critical_equals_plain_ranking(randn):
 
     indices = CriticalSampler(20, net)(points).indices
 
-    for features, rows in zip(net.point_features(points), indices.tolist(), strict=True):
-        contributions = plain_contributions(features)
-        contributing = sum(value > 0 for value in contributions)
-        number = min(20, contributing)
-        expected = sorted(range(60), key=lambda row: -contributions[row])
-        assert rows[:number] == expected[:number]
+    features = net.point_features(points)
+    for cloud, rows in enumerate(indices.tolist()):
+        contributions = plain_contributions(features[cloud])
+        critical = [row for row in range(60) if contributions[row] > 0]
+        expected = sorted(critical, key=lambda row: -contributions[row])[:20]
+        assert rows[: len(expected)] == expected
 
 
 def modes_of(net):
@@ -54,10 +54,14 @@ def test_critical_leaves_net_as_it_is(randn):
 
 
 def test_critical_large_batch_equals_small_ones(randn, monkeypatch):
-    net, points = PointNetVanilla(3), randn(5, 40, 3)
-    whole = CriticalSampler(6, net)(points).indices
+    sampler = CriticalSampler(6, PointNetVanilla(3))
+    points = randn(5, 40, 3)
+    whole = sampler(points).indices
     monkeypatch.setattr("mops_lightning.samplers.critical_points.BATCH_POINTS", 80)
-    assert torch.equal(CriticalSampler(6, net)(points).indices, whole)
+
+    two_by_two = sampler(points).indices
+
+    assert torch.equal(two_by_two, whole)
 
 
 @pytest.mark.parametrize(
@@ -75,8 +79,11 @@ def test_critical_unsuitable_net_raises(net, words):
 def test_critical_by_features_equals_those_of_a_net(randn):
     net = PointNetVanilla(3).eval()
     points = randn(3, 60, 3)
+    features = net.point_features(points)
+
+    found = CriticalSampler(20).by_features(points, features, 20)
+
     expected = CriticalSampler(20, net)(points)
-    found = CriticalSampler(20).by_features(points, net.point_features(points), 20)
     assert torch.equal(found.points, expected.points)
     assert found.indices is not None
     assert torch.equal(gather_points(points, found.indices), found.points)
@@ -97,9 +104,14 @@ class FirstAxis(torch.nn.Module):
     ],
 )
 def test_critical_fills_up_by_farthest_points(line, chosen):
-    points = torch.tensor(line)[None, :, None] * torch.tensor([1.0, 0, 0])
-    rows = CriticalSampler(3, FirstAxis())(points).indices[0].tolist()
-    assert rows == (chosen or plain_farthest(points[0], rows[:1], 3))
+    points = torch.zeros(1, 8, 3)
+    points[0, :, 0] = torch.tensor(line)
+
+    (rows,) = CriticalSampler(3, FirstAxis())(points).indices.tolist()
+
+    if chosen is None:
+        chosen = plain_farthest(points[0], rows[:1], 3)
+    assert rows == chosen
 
 
 def test_critical_ties_keep_seeded_order(randn):
@@ -108,9 +120,16 @@ def test_critical_ties_keep_seeded_order(randn):
             return torch.eye(points.shape[1]).expand(len(points), -1, -1)
 
     points = randn(2, 60, 3)
+    net = OwnChannels()
     for seed in (0, 1):
-        rows = CriticalSampler(20, OwnChannels(), seed)(points).indices
-        assert torch.equal(rows, seeded_order(points, seed)[:, :20])
+        sampler = CriticalSampler(20, net, seed)
+
+        rows = sampler(points).indices
+        rows_by_features = sampler.by_features(points, net.point_features(points), 20).indices
+
+        expected = seeded_order(points, seed)[:, :20]
+        assert torch.equal(rows, expected)
+        assert torch.equal(rows_by_features, expected)
 
 
 def test_critical_leaves_modes_of_a_failing_net_as_they_are(randn):

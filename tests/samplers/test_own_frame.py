@@ -79,6 +79,35 @@ def test_own_axes_of_known_farthest_points():
     assert_close(third, torch.linalg.cross(first, second))
 
 
+def test_own_axes_take_the_widest_of_the_next_three_farthest_points():
+    # Farthest: 10 and −9 along x; then 3 along z; then (8, 5, 0). Nine more balance the mean.
+    points = torch.zeros(1, 13, 3)
+    points[0, 0] = torch.tensor([10.0, 0, 0])
+    points[0, 1] = torch.tensor([-9.0, 0, 0])
+    points[0, 2] = torch.tensor([0, 0, 3.0])
+    points[0, 3] = torch.tensor([8.0, 5.0, 0])
+    points[0, 4:] = -points[0, :4].sum(0) / 9
+
+    (axes,) = own_axes(points)
+
+    assert_close(axes, torch.eye(3))
+
+
+@pytest.mark.parametrize("radius", [1e-3, 1.0, 1e3])
+def test_own_axes_of_a_narrow_cloud_are_known_from_its_width(radius):
+    """Of a hundred thousandth of the radius and less, rounding would decide."""
+    narrow = torch.tensor([[[1.0, 0, 0], [-1, 0, 0], [0, 1e-4, 0], [0, -1e-4, 0]]]) * radius
+    line = torch.tensor([[[1.0, 0, 0], [-1, 0, 0], [0, 1e-6, 0], [0, -1e-6, 0]]]) * radius
+
+    (of_narrow,) = own_axes(narrow)
+    (of_line,) = own_axes(line)
+
+    _, second, third = of_narrow.T.abs()
+    assert_close(second, torch.tensor([0.0, 1.0, 0.0]))
+    assert_close(third, torch.tensor([0.0, 0.0, 1.0]))
+    assert (of_line[:, 1:] == 0).all()
+
+
 def test_own_axes_are_rotations(randn):
     clouds = randn(5, 40, 3, dtype=torch.float64)
     centred = clouds - clouds.mean(1, keepdim=True)

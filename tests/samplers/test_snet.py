@@ -25,26 +25,35 @@ FOR_RECONSTRUCTION: dict[str, Any] = {
     ],
 )
 def test_snet_has_published_layers(settings, channels, norms):
-    parts = list(SNet(32, **settings).modules())
-    layers = [tuple(m.weight.shape) for m in parts if isinstance(m, nn.Linear)]
-    assert layers == [(b, a) for a, b in pairwise(channels)]
-    assert sum(isinstance(m, nn.BatchNorm1d) for m in parts) == norms
+    net = SNet(32, **settings)
+
+    sizes = []
+    for layer in modules_of(net, nn.Linear):
+        sizes.append((layer.in_features, layer.out_features))
+    assert sizes == list(pairwise(channels))
+    assert len(modules_of(net, nn.BatchNorm1d)) == norms
+
+
+def modules_of(net, kind):
+    return [module for module in net.modules() if isinstance(module, kind)]
 
 
 def plain_snet(net, points):
     """The formulas: linear layers with BatchNorm and ReLU, the maximum over points, the head."""
-    linears = [m for m in net.modules() if isinstance(m, nn.Linear)]
-    norms = [m for m in net.modules() if isinstance(m, nn.BatchNorm1d)]
+    linears = modules_of(net, nn.Linear)
+    norms = modules_of(net, nn.BatchNorm1d)
     hidden = points
     for number, (linear, norm) in enumerate(zip(linears, norms, strict=True)):
-        hidden = hidden @ linear.weight.mT + (0 if linear.bias is None else linear.bias)
-        assert norm.running_var is not None
-        scale = norm.weight / (norm.running_var + 1e-5).sqrt()
-        hidden = (hidden - norm.running_mean) * scale + norm.bias
+        hidden = hidden @ linear.weight.mT
+        if linear.bias is not None:
+            hidden = hidden + linear.bias
+        deviation = (norm.running_var + 1e-5).sqrt()
+        hidden = (hidden - norm.running_mean) / deviation
+        hidden = norm.weight * hidden + norm.bias
         if number < len(linears) - 1:
             hidden = hidden.clamp(min=0)
         if number == 2:  # the last pointwise layer
-            hidden = hidden.max(1).values
+            hidden = hidden.amax(1)
     return hidden.reshape(len(points), -1, 3)
 
 
@@ -54,13 +63,19 @@ def test_snet_equals_written_out_formulas(randn):
     for _ in range(3):  # so that the running statistics differ from their initial values
         net(points)
     net.eval()
-    assert_close(net(points).points, plain_snet(net, points))
+
+    generated = net(points).points
+
+    assert_close(generated, plain_snet(net, points))
 
 
 def test_snet_loss_is_weighted_and_in_training_only(randn):
     net = SNet(6, alpha=3.0, coverage=0.5, coverage_per_point=0.25).train()
     points = randn(4, 20, 3)
-    output = net(points)
-    expected = 3 * simplification_loss(points, output.points, 0.5, 0.25)
-    assert_close(output.losses["simplification"], expected)
-    assert net.eval()(points).losses == {}
+
+    in_training = net(points)
+    in_test = net.eval()(points)
+
+    expected = 3 * simplification_loss(points, in_training.points, 0.5, 0.25)
+    assert_close(in_training.losses["simplification"], expected)
+    assert in_test.losses == {}

@@ -90,6 +90,32 @@ def test_stage_sampler_loss_is_alpha_times_the_mean_squared_distance(randn):
     assert losses == {"subset": torch.tensor(13.5)}
 
 
+def test_stage_sampler_overlap_has_its_weight(randn):
+    net = StageMOPSNet(5, 7, overlap=0.25, tau_min=1.0).eval()
+    torch.nn.init.constant_(net.queries.log_width, 2.0)  # all neighbours count
+    points = randn(2, 60, 3)
+    output = net.by_features(points, randn(2, 60, 7), 5)
+
+    losses = net.losses_in_stage(output, torch.zeros(2, 5))
+
+    dense = output.matrix.dense()
+    squares = (dense.mT @ dense).square()
+    squares.diagonal(dim1=1, dim2=2).zero_()
+    expected = 0.25 * squares.sum((1, 2)).mean() / 5
+    assert expected > 0.01
+    assert_close(losses["overlap"], expected)
+
+
+def test_stage_sampler_passes_its_settings_on():
+    net = StageMOPSNet(16, 7, candidates=3, neighbours=5, anchor_width=2.0, overlap=0.5)
+
+    assert net.queries.candidates == 3
+    assert net.queries.neighbours == 5
+    assert net.overlap == 0.5
+    # On a surface, 16 points are twice as far apart as the 64 whose spacing is the unit.
+    assert net.queries.log_width.exp().tolist() == pytest.approx([4.0] * 16)
+
+
 def test_hierarchical_net_gives_its_stages_the_distances_to_the_nearest_points(randn):
     sampler = partial(StageMOPSNet, alpha=2.0, neighbours=4)
     net = HierarchicalNet(3, sampler, points=(12,), channels=(8, 10), k=4, hidden=8)

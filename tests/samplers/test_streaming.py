@@ -9,19 +9,25 @@ from mops_lightning.samplers.base import stream_sample
 
 @pytest.mark.parametrize("size", [1, 7, 1000, 5000])
 def test_stream_sample_equals_whole_cloud(trained, size, randn):
-    points = randn(1, 30 if size == 1 else 3000, 3)
+    number = 30 if size == 1 else 3000
+    cloud = randn(number, 3)
     with torch.no_grad():
-        whole = trained(points).points
-    streamed = stream_sample(trained, lambda: points[0].split(size))
-    assert_close(streamed, whole[0], rtol=0, atol=1e-5)
+        (whole,) = trained(cloud[None]).points
+
+    streamed = stream_sample(trained, lambda: cloud.split(size))
+
+    assert_close(streamed, whole, rtol=0, atol=1e-5)
 
 
 def test_stream_sample_is_nested(randn):
     torch.manual_seed(1)
     sampler = FMOPSNet(24).eval()
-    points = randn(200, 3)
-    few = stream_sample(sampler, lambda: points.split(64), 5)
-    assert_close(few, stream_sample(sampler, lambda: points.split(64))[:5])
+    chunks = randn(200, 3).split(64)
+
+    few = stream_sample(sampler, lambda: chunks, 5)
+    all_points = stream_sample(sampler, lambda: chunks)
+
+    assert_close(few, all_points[:5])
 
 
 @pytest.mark.parametrize(
@@ -44,9 +50,11 @@ def test_stream_sample_invalid_input_raises(make, chunks, message):
 @pytest.mark.parametrize(("clouds", "points"), [(3, 40), (2, 2500), (1, 24)])
 def test_fused_evaluation_equals_layers(trained, clouds, points, randn):
     batch = randn(clouds, points, 3)
+
     plain = trained(batch)
     with torch.no_grad():
         fast = trained(batch)
+
     assert plain.points.requires_grad
     assert not fast.points.requires_grad
     assert_close(fast.points, plain.points.detach(), rtol=1e-4, atol=1e-5)
@@ -56,6 +64,9 @@ def test_fused_evaluation_equals_layers(trained, clouds, points, randn):
 def test_training_without_gradients_uses_batch_statistics(trained, randn):
     batch = randn(3, 40, 3)
     trained.train()
+
     with torch.no_grad():
         fast = trained(batch).points
-    assert_close(fast, trained(batch).points.detach())
+
+    expected = trained(batch).points.detach()
+    assert_close(fast, expected)

@@ -123,8 +123,11 @@ def test_thin_equals_plain_removal():
 
 
 def test_thin_equal_points_leaves_m():
-    points = np.concatenate([np.ones((60, 3)), cloud(4)])
+    equal = np.ones((60, 3))
+    points = np.concatenate([equal, cloud(4)])
+
     rows = thin(points, 10)
+
     assert len(set(rows.tolist())) == 10
 
 
@@ -138,16 +141,22 @@ def test_sample_by_tiles_returns_m_different_rows(sampler):
 
 def test_sample_by_tiles_keeps_seams_free():
     points = street()
-    kept = points[sample_by_tiles(points, 256, 400, FPSSampler(400))]
-    nearest = np.asarray(cKDTree(kept).query(kept, k=2)[0])[:, 1]
-    assert nearest.min() > 0.4 * np.median(nearest)
+
+    rows = sample_by_tiles(points, 256, 400, FPSSampler(400))
+
+    kept = points[rows]
+    distances, _ = cKDTree(kept).query(kept, k=[2])
+    assert np.min(distances) > 0.4 * np.median(distances)
 
 
 def test_sample_by_tiles_keeps_points_in_proportion():
     points = street()
-    kept = points[sample_by_tiles(points, 256, 400, RandomSampler(400))]
-    near = (points[:, 0] < 431_010).mean()
-    assert abs((kept[:, 0] < 431_010).mean() - near) < 0.03
+    is_near = points[:, 0] < 431_010
+
+    rows = sample_by_tiles(points, 256, 400, RandomSampler(400))
+
+    share = is_near[rows].mean()
+    assert share == pytest.approx(is_near.mean(), abs=0.03)
 
 
 def test_sample_by_tiles_samples_every_tile_as_the_sampler_does(sampler):
@@ -160,7 +169,8 @@ def test_sample_by_tiles_samples_every_tile_as_the_sampler_does(sampler):
                 centred = given - given.mean(0)
                 radius = np.linalg.norm(centred, axis=1).max()
                 given = (centred / radius).astype(np.float32)
-            selected: Any = one.select("completed", torch.from_numpy(given)[None], 40)
+            clouds = torch.from_numpy(given[None])
+            selected: Any = one.select("completed", clouds, 40)
             _, (rows,) = selected
             expected.update(tile[rows.numpy()])
 
@@ -169,9 +179,41 @@ def test_sample_by_tiles_samples_every_tile_as_the_sampler_does(sampler):
         assert expected.issuperset(sampled)
 
 
+class Recording(FPSSampler):
+    """Notes how many points of how many tiles are asked for."""
+
+    def __init__(self, m):
+        super().__init__(m)
+        self.asked = []
+
+    def choose_rows(self, points, m, weight=None):
+        self.asked.append((*points.shape[:2], m))
+        return super().choose_rows(points, m, weight)
+
+
+@pytest.mark.parametrize(
+    ("size", "asked"),
+    [
+        (250, (2, 250, 50)),  # a quarter more than 80 points
+        (500, (1, 500, 80)),  # one tile has no seams
+    ],
+)
+def test_sample_by_tiles_samples_a_quarter_more_points_than_it_keeps(size, asked):
+    sampler = Recording(400)
+
+    rows = sample_by_tiles(street(500), size, 80, sampler)
+
+    assert sampler.asked == [asked]
+    assert len(rows) == 80
+
+
 def test_sample_by_tiles_all_points_and_too_many(sampler):
     points = street(500)
-    assert sample_by_tiles(points, 60, 500, sampler).tolist() == list(range(500))
-    assert len(sample_by_tiles(points, 250, 128, sampler)) == 128
+
+    every_row = sample_by_tiles(points, 60, 500, sampler)
+    most_rows = sample_by_tiles(points, 250, 128, sampler)
+
+    assert every_row.tolist() == list(range(500))
+    assert len(most_rows) == 128
     with pytest.raises(UserError, match=r"2 tiles of up to 250 points .* up to 64 points of each"):
         sample_by_tiles(points, 250, 129, sampler)

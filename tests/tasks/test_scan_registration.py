@@ -143,6 +143,19 @@ def test_residuals_of_both_halves_follow_motions_that_grow_to_those_of_a_start(c
             assert is_same.double().mean() > 0.98  # a tie may be broken in another way
 
 
+def test_pairs_of_scans_depend_on_their_own_generators_only(clouds):
+    together = batch_of(clouds)
+
+    generators = [generator(7, row) for row in range(3)]
+    sources, targets = together.points.chunk(2)
+    for row in range(3):
+        alone = task().make_batch(clouds[row : row + 1], [generators[row]])
+        source, target = alone.points
+        assert torch.equal(source, sources[row])
+        assert_close(target, targets[row])
+        assert torch.equal(alone.quaternion[0], together.quaternion[row])
+
+
 def test_halves_of_an_odd_number_of_points_leave_one_out(clouds):
     batch = batch_of(clouds[:, :301])
 
