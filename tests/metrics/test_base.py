@@ -67,6 +67,13 @@ def test_info_survives_json():
     assert MetricInfo("a").as_dict() == {}
 
 
+def test_info_has_the_name_of_the_key_in_the_collection():
+    info = MetricInfo.of("of_chairs", Accuracy(3))
+
+    assert info.name == "of_chairs"
+    assert info.title == "of chairs (%)"
+
+
 @pytest.mark.parametrize("metric", METRICS)
 def test_metric_documents_itself(metric):
     assert "__doc__" in vars(metric)

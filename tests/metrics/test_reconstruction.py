@@ -32,3 +32,26 @@ def test_metric_over_batches_matches_hand_computed_value(metric, value):
         module.update(found, full)
 
     assert module.compute().item() == pytest.approx(value)
+
+
+def chamfer_distances(*values):
+    return Distances(torch.tensor(values), None)
+
+
+def test_error_of_a_cloud_that_the_net_rebuilds_exactly_from_all_points_only_is_infinite():
+    module = reconstruction.NormalizedChamfer()
+
+    module.update(chamfer_distances(2.0), chamfer_distances(0.0))
+
+    assert module.compute() == torch.inf
+
+
+def test_small_distances_after_a_large_one_are_not_lost():
+    module = reconstruction.NormalizedChamferOfMeans()
+    large = 2.0**25
+
+    module.update(chamfer_distances(large), chamfer_distances(large))
+    for _ in range(64):
+        module.update(chamfer_distances(1.0), chamfer_distances(0.0))
+
+    assert module.compute().item() == 1 + 64 / large

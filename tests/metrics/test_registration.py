@@ -105,6 +105,17 @@ def test_recalls_include_limits_of_5_and_10_degrees():
     assert registration.RotationRecall10()(turned, still) == 3 / 4
 
 
+def test_median_error_and_recall_of_2_degrees():
+    turned = turned_about_x(1.9, 2.1, 30.0, 40.0, 50.0)
+    still = motions(Rotation.identity(5))
+
+    median = registration.MedianRotationError()(turned, still)
+    recall = registration.RotationRecall2()(turned, still)
+
+    assert median.item() == pytest.approx(30, abs=1e-3)
+    assert recall.item() == pytest.approx(1 / 5)
+
+
 def test_recall_includes_its_limit():
     turned = turned_about_x(0.0, 90.0)
     still = motions(Rotation.identity(2))

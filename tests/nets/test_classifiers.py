@@ -2,11 +2,12 @@
 
 from typing import Any
 
+import pytest
 import torch
 from torch.testing import assert_close
 
 from mops_lightning.nets.dgcnn import DGCNN
-from mops_lightning.nets.pointnet import PointNetTransform, TransformNet
+from mops_lightning.nets.pointnet import PointNetTransform, PointNetVanilla, TransformNet
 from mops_lightning.ops import compiled
 from mops_lightning.ops.maxima import max_of_rows
 from mops_lightning.ops.points import gather_points
@@ -19,6 +20,28 @@ def test_transform_net_starts_at_identity(randn):
 
     identity = torch.eye(4).expand(3, 4, 4)
     assert_close(matrix, identity)
+
+
+CLASSIFIERS = [
+    PointNetVanilla,
+    PointNetTransform,
+    DGCNN,
+]
+
+
+@pytest.mark.parametrize("classifier", CLASSIFIERS)
+def test_dropout_has_its_probability_and_acts_in_training(classifier, randn):
+    points = randn(4, 30, 3)
+    net = classifier(5, dropout=0.25).train()
+    without = classifier(5, dropout=0.0).train()
+
+    first = net(points)
+    second = net(points)
+
+    (layer,) = [module for module in net.modules() if isinstance(module, torch.nn.Dropout)]
+    assert layer.p == 0.25
+    assert not torch.allclose(first, second, atol=1e-3)
+    assert_close(without(points), without(points))
 
 
 def set_bias(transform, matrix):

@@ -58,6 +58,18 @@ def results_of(net, training, features, direction):
     return out, out_without_gradient, gradients
 
 
+def test_max_pool_updates_statistics_with_the_momentum_of_its_norm(randn):
+    fast, plain = pools()
+    fast.norm.momentum = 0.4
+    plain.norm.momentum = 0.4
+    features = randn(3, 50, 6, dtype=torch.float64)
+
+    fast(features)
+    plain(features)
+
+    assert_close(list(fast.buffers()), list(plain.buffers()))
+
+
 def test_max_pool_frozen_passes_gradients_to_input(randn):
     fast, plain = pools()
     for net in (fast, plain):

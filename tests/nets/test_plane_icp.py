@@ -97,6 +97,20 @@ def test_points_beyond_the_distance_have_no_effect(pair):
     assert_close(found.quaternion, expected.quaternion)
 
 
+def test_gradients_flow_through_the_last_step_only(pair):
+    source, target, _ = pair
+    source.requires_grad_()
+    with torch.no_grad():
+        before = PlaneICP(2)(source, target)
+
+    motion = PlaneICP(3)(source, target)
+
+    step = PlaneICP().step(before, source, target, surface_normals(target))
+    (gradient,) = torch.autograd.grad(motion.quaternion[:, 1:].sum(), source)
+    (expected,) = torch.autograd.grad(step.quaternion[:, 1:].sum(), source)
+    assert_close(gradient, expected)
+
+
 def test_gradients_of_the_last_step_reach_the_source(pair):
     source, target, _ = pair
     source.requires_grad_()

@@ -13,7 +13,8 @@ from tests.ops.test_stability import box
 def plain_ellipsoid(points, rows, place):
     """Compute the spread of one neighbourhood by NumPy's eigenvectors."""
     near = points[rows]
-    variances, axes = np.linalg.eigh(np.cov(near.T, bias=True))
+    covariance = np.cov(near.T, bias=True)
+    variances, axes = np.linalg.eigh(covariance)
     normal = axes[:, 0]
     offset = points[place] - near.mean(0)
     height = offset @ normal
@@ -23,7 +24,8 @@ def plain_ellipsoid(points, rows, place):
 
 def test_ellipsoids_equal_eigenvectors_of_numpy():
     points = box(100)
-    rows = np.asarray(cKDTree(points).query(points, k=12)[1])
+    _, nearest = cKDTree(points).query(points, k=12)
+    rows = np.asarray(nearest)
 
     numbers, normals = ellipsoids(points, rows)
 
@@ -33,12 +35,51 @@ def test_ellipsoids_equal_eigenvectors_of_numpy():
         assert abs(normals[place] @ normal) == pytest.approx(1)
 
 
+def plain_features(points):
+    """Return the features of every point, one number after the other."""
+    centred = points - points.mean(0)
+    centred /= np.linalg.norm(centred, axis=1).mean()
+    distances, nearest = cKDTree(centred).query(centred, k=24)
+    spacing = np.median(distances[:, 5])
+    normals = []
+    for place in range(len(points)):
+        _, normal = plain_ellipsoid(centred, nearest[place, :12], place)
+        normals.append(normal)
+    features = []
+    for place in range(len(points)):
+        numbers = []
+        for k in (6, 12, 24):
+            lengths, _ = plain_ellipsoid(centred, nearest[place, :k], place)
+            lengths.append(distances[place, k - 1])
+            numbers += [np.log(length / spacing + 0.01) for length in lengths]
+        for k in (6, 12, 24):
+            cosines = [abs(normals[place] @ normals[row]) for row in nearest[place, :k]]
+            numbers.append(np.log(1 - np.mean(cosines) + 0.01))
+            numbers.append(np.log(1 - min(cosines) + 0.01))
+        lever = np.cross(centred[place], normals[place])
+        numbers.append(np.linalg.norm(centred[place]))
+        numbers.append(abs(centred[place] @ normals[place]))
+        numbers.append(np.log(np.linalg.norm(lever) + 0.01))
+        numbers.append(np.log(spacing))
+        features.append(numbers)
+    return np.array(features)
+
+
+def test_features_equal_a_plain_form():
+    points = box(150)
+
+    features = describe_neighbourhoods(points).features
+
+    assert features == pytest.approx(plain_features(points), abs=1e-6)
+
+
 def test_features_of_turned_scaled_and_moved_cloud_are_the_same():
     points = box(200)
     turn = Rotation.from_rotvec([0.3, -1.2, 2.0]).as_matrix()
 
     features = describe_neighbourhoods(points).features
-    moved = describe_neighbourhoods(40 * points @ turn.T + [500, -3, 20]).features
+    moved_points = 40 * points @ turn.T + [500, -3, 20]
+    moved = describe_neighbourhoods(moved_points).features
 
     assert features.shape == (200, FEATURES)
     assert moved == pytest.approx(features, abs=1e-6)

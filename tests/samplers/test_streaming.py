@@ -19,6 +19,18 @@ def test_stream_sample_equals_whole_cloud(trained, size, randn):
     assert_close(streamed, whole, rtol=0, atol=1e-5)
 
 
+def test_stream_sample_of_a_sampler_in_training_mode_is_that_of_evaluation(randn):
+    torch.manual_seed(1)
+    sampler = MOPSNet(8)
+    sampler.train()
+    chunks = randn(200, 3).split(64)
+
+    in_training = stream_sample(sampler, lambda: chunks)
+    in_evaluation = stream_sample(sampler.eval(), lambda: chunks)
+
+    assert torch.equal(in_training, in_evaluation)
+
+
 def test_stream_sample_is_nested(randn):
     torch.manual_seed(1)
     sampler = FMOPSNet(24).eval()
