@@ -1,5 +1,7 @@
 """Descriptions of neighbourhoods, beside a plain form and under motions."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -39,7 +41,8 @@ def plain_features(points):
     """Return the features of every point, one number after the other."""
     centred = points - points.mean(0)
     centred /= np.linalg.norm(centred, axis=1).mean()
-    distances, nearest = cKDTree(centred).query(centred, k=24)
+    found: Any = cKDTree(centred).query(centred, k=24)
+    distances, nearest = found
     spacing = np.median(distances[:, 5])
     normals = []
     for place in range(len(points)):

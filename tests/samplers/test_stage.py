@@ -98,6 +98,7 @@ def test_stage_sampler_overlap_has_its_weight(randn):
 
     losses = net.losses_in_stage(output, torch.zeros(2, 5))
 
+    assert output.matrix is not None
     dense = output.matrix.dense()
     squares = (dense.mT @ dense).square()
     squares.diagonal(dim1=1, dim2=2).zero_()
