@@ -5,9 +5,12 @@ import torch
 
 from mops_lightning import FMOPSNet, FPSSampler, MOPSNet, PoissonSampler, RandomSampler
 from mops_lightning.errors import UserError
+from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.by_budget import MOST, ByBudget
 
-FPS, RANDOM, POISSON = FPSSampler(MOST), RandomSampler(MOST), PoissonSampler(MOST)
+FPS = FPSSampler(MOST)
+RANDOM = RandomSampler(MOST)
+POISSON = PoissonSampler(MOST)
 
 
 @pytest.mark.parametrize(
@@ -32,7 +35,8 @@ def test_by_budget_takes_the_method_of_the_number(m, expected):
 
 
 def test_by_budget_takes_farthest_points_for_numbers_that_a_sampler_does_not_return():
-    fixed, flexible = MOPSNet(m=8).eval(), FMOPSNet(m_max=8).eval()
+    fixed = MOPSNet(m=8).eval()
+    flexible = FMOPSNet(m_max=8).eval()
 
     of_fixed = ByBudget([8], [1], [FPS, fixed])
     of_flexible = ByBudget([8, 12], [1, 1], [FPS, flexible])
@@ -40,6 +44,7 @@ def test_by_budget_takes_farthest_points_for_numbers_that_a_sampler_does_not_ret
     assert of_fixed.sampler_for(8) is fixed
     assert of_fixed.sampler_for(7) is FPS
     assert of_flexible.sampler_for(7) is flexible
+    assert of_flexible.sampler_for(8) is flexible
     assert of_flexible.sampler_for(10) is FPS
 
 
@@ -49,14 +54,15 @@ def test_by_budget_returns_the_completed_set_of_a_trained_sampler(rand):
     sampler = ByBudget([8, 32], [1, 0], [FPS, trained]).eval()
 
     output = sampler(points, 8)
-    larger = sampler.downsample(points, 32)
+    farthest, farthest_rows = sampler.downsample(points, 32)
 
     expected, rows = trained.select("completed", points, 8)
+    _, expected_farthest_rows = FPSSampler(32).downsample(points, 32)
     assert rows is not None
     assert output.indices.tolist() == rows.tolist()
     assert torch.equal(output.points, expected)
-    assert torch.equal(larger[1], FPSSampler(32).downsample(points, 32)[1])
-    assert torch.equal(larger[0], points.gather(1, larger[1][..., None].expand(-1, -1, 3)))
+    assert torch.equal(farthest_rows, expected_farthest_rows)
+    assert torch.equal(farthest, gather_points(points, farthest_rows))
 
 
 def test_by_budget_shows_channels_to_the_samplers_that_take_them(rand):
@@ -67,9 +73,10 @@ def test_by_budget_shows_channels_to_the_samplers_that_take_them(rand):
     rows = sampler(points, 8).indices
     farthest = sampler(points, 16)
 
-    expected = trained.select("completed", points, 8)[0]
-    assert torch.equal(points.gather(1, rows[..., None].expand(-1, -1, 5)), expected)
-    assert torch.equal(farthest.points, FPSSampler(16)(points).points)
+    expected, _ = trained.select("completed", points, 8)
+    expected_farthest = FPSSampler(16)(points)
+    assert torch.equal(gather_points(points, rows), expected)
+    assert torch.equal(farthest.points, expected_farthest.points)
 
 
 @pytest.mark.parametrize(
@@ -78,6 +85,7 @@ def test_by_budget_shows_channels_to_the_samplers_that_take_them(rand):
         (([8], [0], [RANDOM]), "begin with farthest"),
         (([8], [0], []), "begin with farthest"),
         (([], [], [FPS]), "ascending"),
+        (([0, 8], [0, 0], [FPS]), "ascending"),
         (([16, 8], [0, 0], [FPS]), "ascending"),
         (([8, 8], [0, 0], [FPS]), "ascending"),
         (([8], [0, 0], [FPS]), "ascending"),

@@ -41,6 +41,7 @@ LIMITS: list[tuple[type[Sampler], dict[str, Any]]] = [
     (SampleNet, {"k": 1, "beta": 0.0, "gamma": 0.0, "sigma_min": 0.0}),
     (SampleNet, {"k": 60}),
     (MOPSNet, {"anchor_width": 0.5}),
+    (MOPSNet, {"anchors": "fps", "anchor_width": 100.0}),
     (ProgressiveSampleNet, {"min_size": 1}),
 ]
 """The smallest and largest allowed arguments."""
@@ -104,11 +105,14 @@ def test_constructor_has_the_defaults_of_its_file(name):
     defaults: dict[str, Any] = {}
     for cls in reversed(accepting_classes(get_class(node._target_))):
         if issubclass(cls, Sampler):
-            arguments = signature(cls.__init__).parameters.values()
-            defaults |= {a.name: a.default for a in arguments if a.default is not Parameter.empty}
-    for argument in defaults.keys() - OTHERS:
-        default = defaults[argument]
-        assert node[argument] == (list(default) if isinstance(default, tuple) else default)
+            for argument in signature(cls.__init__).parameters.values():
+                if argument.default is not Parameter.empty:
+                    defaults[argument.name] = argument.default
+    for name_of_argument in defaults.keys() - OTHERS:
+        default = defaults[name_of_argument]
+        if isinstance(default, tuple):
+            default = list(default)
+        assert node[name_of_argument] == default
 
 
 @pytest.mark.parametrize("sampler", package_samplers())
@@ -119,9 +123,12 @@ def test_sampler_declares_sizes(sampler):
 
 @pytest.mark.parametrize(("sampler", "arguments"), LIMITS)
 def test_constructor_accepts_limits(sampler, arguments, randn):
-    made = sampler(8, **arguments)
+    made = sampler(8, **arguments).train()
     clouds = randn(3, 60, 3)
-    assert made.train()(clouds).points.shape == (3, 8, 3)
+
+    output = made(clouds)
+
+    assert output.points.shape == (3, 8, 3)
 
 
 @pytest.mark.parametrize(("sampler", "arguments", "message"), INVALID)

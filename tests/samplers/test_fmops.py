@@ -1,5 +1,6 @@
 import itertools
 import math
+from statistics import mean
 
 import pytest
 import torch
@@ -21,19 +22,30 @@ def test_fmops_equals_mops_with_sliced_weights(randn):
     state = flexible.state_dict()
     state["queries.weight"] = state["queries.weight"][:5]
     fixed.load_state_dict(state, strict=True)
-    assert_close(fixed.eval()(points).points, flexible.eval()(points, 5).points)
+
+    of_fixed = fixed.eval()(points)
+    of_flexible = flexible.eval()(points, 5)
+
+    assert_close(of_fixed.points, of_flexible.points)
 
 
 def test_fmops_sizes_share_one_forward_pass(randn):
     points = randn(3, 40, 3)
     net = small(alpha=2.0).train()
     calls = []
-    net.features.register_forward_hook(lambda *_: calls.append(1))
+
+    def note_call(*_):
+        calls.append(1)
+
+    net.features.register_forward_hook(note_call)
+
     outputs = net.sample_sizes(points, (2, 16, 7))
+
     assert len(calls) == 1
     assert list(outputs) == [2, 16, 7]
     for m, output in outputs.items():
-        assert output.points.shape[1] == len(output.matrix.queries) == m
+        assert output.points.shape[1] == m
+        assert output.matrix.m == m
         expected = 2 * subset_loss(points, output.points)
         assert_close(output.losses["subset"], expected)
 
@@ -45,15 +57,29 @@ def drawn(number, m_max=512, **settings):
 
 
 def test_uniform_training_sizes_have_documented_distribution():
-    sizes = torch.tensor(drawn(4000, size_sampling="uniform")).flatten().double()
+    steps = drawn(4000, size_sampling="uniform")
 
-    assert sizes.min() == 1
-    assert sizes.max() == 512
-    assert sizes.mean() == pytest.approx(256.5, rel=0.03)
+    sizes = [size for (size,) in steps]
+    assert min(sizes) == 1
+    assert max(sizes) == 512
+    assert mean(sizes) == pytest.approx(256.5, rel=0.03)
 
 
 def share(condition):
     return condition.double().mean()
+
+
+def parts_of(sizes):
+    """Return the place of each size in its quarter of the range of logarithms up to 513."""
+    return torch.tensor(sizes).log() / math.log(513) * 4
+
+
+def test_nested_training_sizes_are_drawn_independently():
+    steps = [sizes for sizes in drawn(2000, num_sizes=4) if len(sizes) == 4]
+
+    third, fourth = parts_of(steps)[:, 2:].T
+    correlation = torch.corrcoef(torch.stack([third, fourth]))[0, 1]
+    assert abs(correlation) < 0.1
 
 
 def test_single_training_sizes_have_documented_distribution():

@@ -1,6 +1,7 @@
 import struct
 
 import numpy as np
+import pytest
 import torch
 
 from mops_lightning.samplers.ordering import (
@@ -18,32 +19,68 @@ WORD = 2**64
 def plain_hashes(cloud, seed):
     """The same hash with unbounded integers."""
 
-    def fold(key, shift):
-        return key ^ (key >> shift)
-
     keys = []
     for point in cloud.tolist():
         key = (seed * STEP + 1) % WORD
         for coordinate in point:
-            (bits,) = struct.unpack("<Q", struct.pack("<d", coordinate + 0.0))
-            key = fold((key ^ bits) * FIRST % WORD, 32)
+            key ^= bits_of(coordinate + 0.0)
+            key = key * FIRST % WORD
+            key = folded(key, 32)
         keys.append(key)
-    whole = sum(fold(key, 29) * SECOND for key in keys) % WORD
-    result = []
-    for key in keys:
-        key = fold((key + whole) % WORD, 30) * FIRST % WORD
-        result.append(fold(fold(key, 27) * SECOND % WORD, 31))
-    return result
+    words = [folded(key, 29) * SECOND for key in keys]
+    of_cloud = sum(words) % WORD
+    return [scrambled((key + of_cloud) % WORD) for key in keys]
 
 
-def test_point_hashes_equal_plain_form(randn):
-    points = randn(2, 40, 3)
-    points[0, :9, 1] = -0.0  # equal to 0
-    for seed in (0, 7, -3, 2**63):
-        hashes = point_hashes(points, seed)
-        for cloud, row in zip(points, hashes.tolist(), strict=True):
-            assert [key % WORD for key in row] == plain_hashes(cloud, seed)
-        assert torch.equal(point_hashes(points.double(), seed), hashes)
-        compiled = compiled_hashes(points, seed).view(np.int64)
-        assert torch.equal(torch.from_numpy(compiled), hashes)
-        assert torch.equal(seeded_order(points, seed), hashes.argsort(1))
+def bits_of(number):
+    """Return the bits of a float64 as a whole number."""
+    (bits,) = struct.unpack("<Q", struct.pack("<d", number))
+    return bits
+
+
+def folded(key, shift):
+    return key ^ (key >> shift)
+
+
+def scrambled(key):
+    key = folded(key, 30) * FIRST % WORD
+    key = folded(key, 27) * SECOND % WORD
+    return folded(key, 31)
+
+
+SEEDS = (0, 7, -3, 2**63)
+
+
+@pytest.fixture
+def points(randn):
+    clouds = randn(2, 40, 3)
+    clouds[0, :9, 1] = -0.0  # equal to 0
+    return clouds
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_point_hashes_equal_plain_form(seed, points):
+    hashes = point_hashes(points, seed)
+
+    for cloud, row in zip(points, hashes.tolist(), strict=True):
+        unsigned = [key % WORD for key in row]
+        assert unsigned == plain_hashes(cloud, seed)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_point_hashes_of_both_precisions_and_of_loops_are_equal(seed, points):
+    hashes = point_hashes(points, seed)
+
+    of_double = point_hashes(points.double(), seed)
+    compiled = compiled_hashes(points, seed).view(np.int64)
+
+    assert torch.equal(of_double, hashes)
+    assert np.array_equal(compiled, hashes)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_seeded_order_is_that_of_the_hashes(seed, points):
+    order = seeded_order(points, seed)
+
+    hashes = point_hashes(points, seed)
+    assert torch.equal(order, hashes.argsort(1))

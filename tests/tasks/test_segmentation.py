@@ -34,6 +34,12 @@ class Halves(nn.Module):
         return torch.stack([-points[..., 0], points[..., 0]], 2) * 50
 
 
+def small_net(parts):
+    points = (20, 8)
+    channels = (8, 16, 16)
+    return HierarchicalSegmentation(parts, FPSSampler, points, channels, k=4)
+
+
 def plainly_interpolated(values, points, query):
     """Return the mean of the values at the 3 nearest points, weighted by inverse squares."""
     squared = (points - query).square().sum(1)
@@ -175,7 +181,7 @@ def test_loss_of_a_single_known_point_is_its_own(randn):
     parts = torch.full((2, 30), UNKNOWN)
     parts[1, 7] = 1
     batch = Batch(points, torch.zeros(2).long(), parts=parts)
-    task = Segmentation(HierarchicalSegmentation(2, FPSSampler, (20, 8), (8, 16, 16), 4), 2).eval()
+    task = Segmentation(small_net(2), 2).eval()
 
     result = task.step(batch, points)
 
@@ -213,7 +219,7 @@ def test_interpolation_from_no_point_is_refused(k):
 
 
 def test_net_follows_order_of_points(rng, randn):
-    net = HierarchicalSegmentation(5, FPSSampler, (20, 8), (8, 16, 16), 4).eval()
+    net = small_net(5).eval()
     points = randn(2, 40, 3)
     order = torch.randperm(40, generator=rng)
 
@@ -222,14 +228,23 @@ def test_net_follows_order_of_points(rng, randn):
 
     assert logits.shape == (2, 40, 5)
     assert_close(logits_in_order, logits[:, order], atol=1e-4, rtol=1e-4)
-    assert net(points[:, :3]).shape == (2, 3, 5)
+
+
+def test_net_takes_fewer_points_than_its_stages_sample(randn):
+    net = small_net(5).eval()
+    points = randn(2, 3, 3)
+
+    logits = net(points)
+
+    assert logits.shape == (2, 3, 5)
 
 
 def test_net_trains_every_weight(randn):
-    net = HierarchicalSegmentation(5, FPSSampler, (20, 8), (8, 16, 16), 4).train()
+    net = small_net(5).train()
     points = randn(2, 40, 3)
 
-    net(points).square().sum().backward()
+    loss = net(points).square().sum()
+    loss.backward()
 
     for name, weights in net.named_parameters():
         assert weights.grad is not None, name
@@ -245,15 +260,18 @@ def test_shapes_know_their_parts(tmp_path):
 
     train: Any = data.train
     for label, name in enumerate(data.class_names):
-        of_class = train.parts[train.labels == label]
-        names = {data.part_names[part] for part in of_class.unique()}
+        is_of_class = train.labels == label
+        parts_of_class = train.parts[is_of_class].unique()
+        names = {data.part_names[part] for part in parts_of_class}
         assert names <= set(PARTS[name])
     seat = data.part_names.index("seat")
     leg = data.part_names.index("leg")
     for cloud, parts in zip(train.points, train.parts, strict=True):
-        if (parts == seat).any():
+        is_seat = parts == seat
+        is_leg = parts == leg
+        if is_seat.any():
             height = cloud[:, 1]
-            assert height[parts == leg].mean() < height[parts == seat].mean()
+            assert height[is_leg].mean() < height[is_seat].mean()
     cached: Any = from_cache.train
     assert torch.equal(cached.parts, train.parts)
     is_chair = train.labels == data.class_names.index("chair")
