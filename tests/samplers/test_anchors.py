@@ -189,6 +189,17 @@ def test_anchors_refuse_chunks(randn):
         stream_sample(net, lambda: points.split(20))
 
 
+def test_columns_keep_their_distances_far_from_the_origin(randn):
+    points = randn(2, 90, 3)
+    far = points + 1000
+    net = small(tau_min=1.0).eval()
+
+    generated = net(points).points
+    generated_far = net(far).points
+
+    assert_close(generated_far - 1000, generated, atol=0.01, rtol=0)
+
+
 def test_columns_of_coincident_points_have_a_least_width():
     points = torch.zeros(1, 80, 3)
     points[0, 40:, 0] = 0.002  # two places, 40 points each

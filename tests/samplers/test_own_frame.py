@@ -52,6 +52,29 @@ def test_sample_of_a_turned_cloud_is_the_turned_sample(columns, rng):
     assert_close(sample_of_turned, sample @ rotations.mT + shift)
 
 
+NORMALS = PointChannels(
+    (
+        Channel("normal_x"),
+        Channel("normal_y"),
+        Channel("normal_z"),
+    )
+)
+
+
+def test_sample_of_a_turned_cloud_with_normals_is_the_turned_sample(rng, randn):
+    clouds, turned, rotations, shift = turned_pair(rng)
+    normals = torch.nn.functional.normalize(randn(3, 70, 3).double(), dim=2)
+    points = torch.cat([clouds, normals], 2)
+    turned_points = torch.cat([turned, normals @ rotations.mT], 2)
+    sampler = moved_sampler("framed", point_channels=NORMALS)
+
+    sample = sampler(points).points
+    sample_of_turned = sampler(turned_points).points
+
+    assert_close(sample_of_turned[..., :3], sample[..., :3] @ rotations.mT + shift)
+    assert_close(sample_of_turned[..., 3:], sample[..., 3:] @ rotations.mT)
+
+
 def test_sample_of_plain_anchors_does_not_turn_with_its_cloud(rng):
     clouds, turned, rotations, shift = turned_pair(rng)
     sampler = moved_sampler("fps")
@@ -139,17 +162,10 @@ def test_normals_turn_with_the_cloud(rng, randn):
     clouds, turned, rotations, _ = turned_pair(rng)
     directions = randn(clouds.shape).double()
     normals = torch.nn.functional.normalize(directions, dim=2)
-    channels = PointChannels(
-        (
-            Channel("normal_x"),
-            Channel("normal_y"),
-            Channel("normal_z"),
-        )
-    )
     points = torch.cat([clouds, normals], 2)
     turned_points = torch.cat([turned, normals @ rotations.mT], 2)
 
-    described = in_own_frame(points, channels)
-    described_turned = in_own_frame(turned_points, channels)
+    described = in_own_frame(points, NORMALS)
+    described_turned = in_own_frame(turned_points, NORMALS)
 
     assert_close(described, described_turned)
