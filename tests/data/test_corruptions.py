@@ -162,9 +162,9 @@ def maps_of_many(kind, severity):
     points = torch.randn(200, 12, 3, generator=rng)
     many = Clouds(points, torch.zeros(200, dtype=torch.long))
     mapped = corrupt(many, f"{kind}-{severity}").points
-    before = points - points.mean(1, keepdim=True)
-    after = mapped - mapped.mean(1, keepdim=True)
-    return linear_map(before, after)
+    mean_before = points.mean(1, keepdim=True)
+    mean_after = mapped.mean(1, keepdim=True)
+    return linear_map(points - mean_before, mapped - mean_after)
 
 
 @pytest.mark.parametrize(
@@ -207,8 +207,8 @@ def test_axes_are_scaled_up_and_down_by_the_factor_of_their_severity(severity, f
 def test_shear_mixes_coordinates_up_to_the_amount_of_its_severity(severity):
     matrices = maps_of_many("shear", severity)
 
-    scale = matrices[:, 0, 0]
-    mixed = matrices / scale[:, None, None] - torch.eye(3)
+    scale = matrices[:, :1, :1]
+    mixed = matrices / scale - torch.eye(3)
     amount = 0.05 * severity
     assert 0.98 * amount < mixed.amax() <= amount + 1e-4
     assert -amount - 1e-4 <= mixed.amin() < -0.98 * amount
@@ -220,13 +220,16 @@ def test_distortion_equals_scipys_interpolation_of_its_lattice(clouds, severity)
 
     nodes = np.linspace(-1, 1, 5)
     for number, (before, after) in enumerate(zip(clouds.points, distorted, strict=True)):
-        drawn = torch.rand(3, 5, 5, 5, generator=generator(17, number))
+        rng = generator(17, number)
+        drawn = torch.rand(3, 5, 5, 5, generator=rng)
         offsets_of_nodes = 0.1 * severity * (2 * drawn - 1)
-        by_z_y_x = offsets_of_nodes.permute(1, 2, 3, 0).numpy()
-        offsets = interpn((nodes, nodes, nodes), by_z_y_x, before.flip(1).numpy())
+        lattice = offsets_of_nodes.permute(1, 2, 3, 0).numpy()
+        z_y_x = before.flip(1).numpy()
+        offsets = interpn((nodes, nodes, nodes), lattice, z_y_x)
         moved = before + torch.from_numpy(offsets)
         centred = moved - moved.mean(0)
-        expected = centred / centred.norm(dim=1).max()
+        radius = centred.norm(dim=1).max()
+        expected = centred / radius
         assert_close(after, expected.float(), atol=1e-5, rtol=0)
 
 
@@ -295,11 +298,12 @@ def test_density_changes_inside_or_outside_of_one_neighbourhood(clouds):
 def test_density_changes_outside_of_every_one_of_several_neighbourhoods(clouds, places):
     size = N // 10
     for number, cloud in enumerate(clouds.points):
+        near = neighbourhoods(cloud, size)
         rng = generator(17, number)
         is_kept = torch.zeros(N, dtype=torch.bool)
         for _ in range(places):
             row = torch.randint(N, (), generator=rng)
-            is_kept |= neighbourhoods(cloud, size)[row]
+            is_kept |= near[row]
 
         gone = removed(clouds, f"density_up-{places}", number)
 

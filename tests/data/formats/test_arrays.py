@@ -11,27 +11,42 @@ from mops_lightning.errors import UserError
 from tests.support.cloud_files import contents, write_table
 
 
-@pytest.mark.parametrize("chunked", [True, False])
+def first_rows(path):
+    """Read the beginning of a file, as ``--chunk`` does."""
+    return open_cloud_file(path).read(range(9))
+
+
+READERS = pytest.mark.parametrize("reader", [first_rows, contents], ids=["True", "False"])
+
+
+@READERS
 @pytest.mark.parametrize("shape", [(20, 10), ()])
-def test_npy_fields_of_wrong_shape_are_rejected(shape, chunked, tmp_path):
+def test_npy_fields_of_wrong_shape_are_rejected(shape, reader, tmp_path):
     path = tmp_path / "a.npy"
-    np.save(path, np.zeros(shape, [("x", "f4"), ("y", "f4"), ("z", "f4")]))
+    fields = [("x", "f4"), ("y", "f4"), ("z", "f4")]
+    np.save(path, np.zeros(shape, fields))
+
     with pytest.raises(UserError, match="one row of fields"):
-        open_cloud_file(path) if chunked else contents(path)
+        reader(path)
 
 
-@pytest.mark.parametrize("chunked", [True, False])
-def test_npy_complex_coordinates_are_rejected(chunked, tmp_path):
+@READERS
+def test_npy_complex_coordinates_are_rejected(reader, tmp_path):
     path = tmp_path / "a.npy"
-    np.save(path, np.zeros(20, [("x", "f4"), ("y", "c8"), ("z", "f4")]))
+    fields = [("x", "f4"), ("y", "c8"), ("z", "f4")]
+    np.save(path, np.zeros(20, fields))
+
     with pytest.raises(UserError, match="y must be numbers, got complex64"):
-        open_cloud_file(path).read(range(9)) if chunked else contents(path)
+        reader(path)
 
 
 def test_npy_fortran_order_is_rejected_in_chunks(tmp_path):
-    np.save(tmp_path / "a.npy", np.asfortranarray(np.ones((90, 3))))
+    path = tmp_path / "a.npy"
+    by_column = np.asfortranarray(np.ones((90, 3)))
+    np.save(path, by_column)
+
     with pytest.raises(UserError, match="C order"):
-        open_cloud_file(tmp_path / "a.npy")
+        open_cloud_file(path)
 
 
 @pytest.mark.parametrize("kind", ["las", "laz", "copc.laz"])
@@ -40,13 +55,14 @@ def test_npz_arrays_become_dimensions_of_las_and_arrays_again(kind, tmp_path):
     path = tmp_path / f"cloud.{kind}"
     target = tmp_path / "back.npz"
     rng = np.random.default_rng(0)
-    scores = rng.random((20, 4)).astype(np.float32)
+    scores = rng.random((20, 4), np.float32)
+    number = np.arange(20)
     named_alike: dict[str, Any] = {
-        "normals": rng.normal(size=(20, 3)).astype(np.float32),
+        "normals": rng.random((20, 3), np.float32),
         "uv": rng.random((20, 2)),
-        "rgb": rng.integers(0, 256, (20, 3)).astype(np.uint8),
-        "classification": np.arange(20, dtype=np.uint8) % 6,
-        "intensity": np.arange(20, dtype=np.uint16) * 3000,
+        "rgb": rng.integers(0, 256, (20, 3), np.uint8),
+        "classification": np.uint8(number % 6),
+        "intensity": np.uint16(number * 3000),
     }
     points = np.arange(60.0).reshape(20, 3)
     np.savez(source, points=points, **named_alike, scores=scores)
@@ -62,9 +78,10 @@ def test_npz_arrays_become_dimensions_of_las_and_arrays_again(kind, tmp_path):
     assert extra == ["normals", "uv", "rgb", *scores_apart]
     for name, values in named_alike.items():
         in_las = np.asarray(las[name])
+        in_npz = back[name]
         assert np.array_equal(in_las[order], values)
-        assert np.array_equal(back[name][order], values)
-        assert back[name].dtype == values.dtype
+        assert np.array_equal(in_npz[order], values)
+        assert in_npz.dtype == values.dtype
     joined_scores = np.column_stack([back[name] for name in scores_apart])
     assert np.array_equal(joined_scores[order], scores)
 

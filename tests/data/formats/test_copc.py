@@ -13,6 +13,7 @@ from mops_lightning.data.formats.las import octree
 from mops_lightning.data.formats.registry import open_cloud_file, read, write
 from mops_lightning.data.formats.table import Table, TableParts
 from mops_lightning.errors import UserError
+from tests.support.clouds import uniform_points
 from tests.support.las import EXTRA, full_cloud, header_fields
 
 
@@ -79,14 +80,14 @@ def test_copclib_finds_every_point_in_its_cell(small_cells, tmp_path):
     assert len(nodes) > 20
     assert max(node.key.d for node in nodes) >= 2
     assert file.ValidateSpatialBounds()
+    names = ["x", "y", "z", "gps_time", "classification", "red"]
     found = []
     for node in nodes:
         for point in file.GetPoints(node):
-            place = (point.x, point.y, point.z)
-            found.append((*place, point.gps_time, point.classification, point.red))
-    columns = [cloud.x, cloud.y, cloud.z, cloud.gps_time, cloud.classification, cloud.red]
+            found.append([getattr(point, name) for name in names])
+    columns = [cloud[name] for name in names]
     expected = np.stack(columns, axis=1).tolist()
-    assert sorted(found) == sorted(map(tuple, expected))
+    assert sorted(found) == sorted(expected)
     with laspy.CopcReader.open(out) as reader:
         info = reader.copc_info
     assert info.gps_min == cloud.gps_time.min()
@@ -95,10 +96,11 @@ def test_copclib_finds_every_point_in_its_cell(small_cells, tmp_path):
 
 def test_levels_are_even_samples(small_cells, tmp_path):
     out = tmp_path / "out.copc.laz"
-    plane = np.random.default_rng(0).uniform(0, 100, (9000, 3)) * [1, 1, 0.01]
+    plane = uniform_points(9000, 0) * [100, 100, 1]
     dense = plane[:3000] * 0.2
+    points = np.vstack([plane, dense])
 
-    write(out, Table(np.vstack([plane, dense])))
+    write(out, Table(points))
 
     with laspy.CopcReader.open(out) as reader:
         low = reader.header.mins
@@ -112,29 +114,39 @@ def test_levels_are_even_samples(small_cells, tmp_path):
         assert len(points) <= 1.4 * side**2
 
 
-@pytest.mark.parametrize(("share_of_side", "level"), [(1.01 / 128, 0), (0.99 / 128, 1)])
+@pytest.mark.parametrize(
+    ("share_of_side", "level"),
+    [
+        (1.01 / 128, 0),
+        (0.99 / 128, 1),
+    ],
+)
 def test_resolution_is_compared_with_one_128th_of_the_side(
     small_cells, tmp_path, share_of_side, level
 ):
     out = tmp_path / "out.copc.laz"
-    points = np.random.default_rng(0).uniform(0, 100, (4000, 3))
+    points = 100 * uniform_points(4000, 0)
     write(out, Table(points))
     with laspy.CopcReader.open(out) as reader:
         side = 2 * reader.copc_info.halfsize
+    resolution = share_of_side * side
 
-    found = read(out, 1, 0, Area(resolution=share_of_side * side)).points
+    found = read(out, 1, 0, Area(resolution=resolution)).points
 
-    assert len(found) == len(read(out, 1, 0, Area(level=level)).points)
+    of_level = read(out, 1, 0, Area(level=level)).points
+    assert len(found) == len(of_level)
     assert len(found) < len(points)
 
 
 def test_area_of_a_written_file_equals_the_points_in_it(small_cells, tmp_path):
     out = tmp_path / "out.copc.laz"
-    unit = np.random.default_rng(1).uniform(0, 100, (4000, 3))
-    points = unit + np.array([1e6, 5e6, 0])
+    unit = uniform_points(4000, 1)
+    points = 100 * unit + np.array([1e6, 5e6, 0])
     row = np.arange(4000, dtype=np.uint16)
     write(out, Table(points, {"row": row}))
-    area = Area((1000010, 5000020, -1), (1000030, 5000080, 101))
+    low = (1000010, 5000020, -1)
+    high = (1000030, 5000080, 101)
+    area = Area(low, high)
 
     found = read(out, 1, 0, area).columns["row"]
 
@@ -149,10 +161,13 @@ def test_area_of_a_written_file_equals_the_points_in_it(small_cells, tmp_path):
 def write_by_parts(path, source, size):
     """Write the points of a file as COPC, read in parts of a number of points."""
     whole = read(source, 1, 0)
-    corners = np.stack([whole.points.min(0), whole.points.max(0)])
+    low = whole.points.min(0)
+    high = whole.points.max(0)
+    corners = np.stack([low, high])
     file = open_cloud_file(source)
     tables = (file.read(rows) for rows in file.row_ranges(size))
-    write(path, TableParts(tables, 4000, corners, np.dtype("f8"), {}, file.header))
+    parts = TableParts(tables, 4000, corners, np.dtype("f8"), {}, file.header)
+    write(path, parts)
 
 
 def test_parts_in_any_order_and_size_give_the_same_cells(small_cells, tmp_path):
@@ -170,8 +185,9 @@ def test_parts_in_any_order_and_size_give_the_same_cells(small_cells, tmp_path):
 @pytest.mark.parametrize("number", [1, 3])
 def test_copies_of_one_point_are_a_file(number, small_cells, tmp_path):
     out = tmp_path / "a.copc.laz"
+    points = np.full((number, 3), 7.5)
 
-    write(out, Table(np.full((number, 3), 7.5)))
+    write(out, Table(points))
 
     found = np.asarray(all_points(out).x)
     assert found.tolist() == [7.5] * number
@@ -179,7 +195,9 @@ def test_copies_of_one_point_are_a_file(number, small_cells, tmp_path):
 
 def test_more_equal_points_than_a_cell_holds_are_kept(small_cells, tmp_path):
     out = tmp_path / "a.copc.laz"
-    points = np.repeat([[0.0, 0, 0], [1, 1, 1]], 900, axis=0)
+    zeros = np.zeros((900, 3))
+    ones = np.ones((900, 3))
+    points = np.vstack([zeros, ones])
 
     write(out, Table(points))
 
@@ -219,7 +237,8 @@ def test_geotiff_keys_are_converted(tmp_path):
     out = tmp_path / "out.copc.laz"
     utm = CRS.from_epsg(25832)
     cloud = full_cloud(3)
-    cloud.header.vlrs = [record for record in cloud.header.vlrs if record.record_id != 2112]
+    without_wkt = [record for record in cloud.header.vlrs if record.record_id != 2112]
+    cloud.header.vlrs = without_wkt
     cloud.header.add_crs(utm)
     cloud.write(source)
 
@@ -251,7 +270,9 @@ def test_copc_says_that_a_coordinate_system_is_in_wkt_as_new_formats_require(for
 def test_geotiff_keys_need_pyproj(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyproj", None)
     source = tmp_path / "a.laz"
-    keys = np.array([1, 1, 0, 1, 3072, 0, 1, 25832], "<u2")
+    one_key = [1, 1, 0, 1]
+    projection = [3072, 0, 1, 25832]
+    keys = np.array([*one_key, *projection], "<u2")
     record = laspy.VLR("LASF_Projection", 34735, "", keys.tobytes())
     cloud = full_cloud(3)
     cloud.header.vlrs = laspy.vlrs.vlrlist.VLRList([record])

@@ -1,15 +1,17 @@
 """E57 files, written by pye57."""
 
 import sys
+from typing import Any
 
 import numpy as np
 import pye57
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from mops_lightning.data.formats import e57, splats
 from mops_lightning.errors import UserError
 from tests.support.cloud_files import contents
-from tests.support.downsample import call, refused
+from tests.support.downsample import done, refused
 
 QUARTER_TURN = np.array([np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
 """Quaternion of a quarter turn about z."""
@@ -17,12 +19,12 @@ QUARTER_TURN = np.array([np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
 
 def scan(number, **more):
     random = np.random.default_rng(number)
-    columns = {}
+    columns: dict[str, Any] = {}
     for axis in AXES:
         columns[axis] = random.random(30)
-    columns["intensity"] = random.random(30).astype(np.float32)
+    columns["intensity"] = random.random(30, np.float32)
     for colour in COLOURS:
-        columns[colour] = random.integers(0, 256, 30).astype(np.uint8)
+        columns[colour] = random.integers(0, 256, 30, np.uint8)
     return columns | more
 
 
@@ -49,7 +51,9 @@ def test_read_e57_joins_scans_at_their_poses(tmp_path):
 
     x, y, z = points_of(second).T
     turned = np.column_stack([-y, x, z])
-    expected = np.concatenate([points_of(first) + first_shift, turned + second_shift])
+    of_first = points_of(first) + first_shift
+    of_second = turned + second_shift
+    expected = np.concatenate([of_first, of_second])
     columns = table.columns
     assert_allclose(table.points, expected, atol=1e-12)
     assert columns["scan"].tolist() == [0] * 30 + [1] * 30
@@ -63,38 +67,48 @@ def test_downsample_e57_leaves_invalid_points_out(tmp_path):
     invalid = np.zeros(30, np.int8)
     invalid[:3] = 1
     invalid[3] = 2  # only its direction is valid
+    data = scan(1, cartesianInvalidState=invalid)
     with pye57.E57(str(path), mode="w") as file:
-        file.write_scan_raw(scan(1, cartesianInvalidState=invalid))
+        file.write_scan_raw(data)
 
-    status, said, _ = call(path, tmp_path / "b.ply", "--method", "fps", "--m", 10)
+    said = done(path, tmp_path / "b.ply", "--method", "fps", "--m", 10)
 
-    assert status == 0
     assert "10 of 26 points (4 more without finite coordinates left out)" in said
 
 
 def test_e57_as_output_is_refused_with_the_reason(tmp_path):
-    np.save(tmp_path / "a.npy", np.ones((9, 3)))
+    source = tmp_path / "a.npy"
+    np.save(source, np.ones((9, 3)))
 
-    said = refused(tmp_path / "a.npy", tmp_path / "b.e57", "--method", "fps", "--m", 3)
+    said = refused(source, tmp_path / "b.e57", "--method", "fps", "--m", 3)
 
     assert "pye57 stores coordinates in single precision" in said
 
 
 def test_broken_e57_is_named(tmp_path):
-    (tmp_path / "a.e57").write_bytes(b"ASTM-E57" + bytes(90))
+    path = tmp_path / "a.e57"
+    path.write_bytes(b"ASTM-E57" + bytes(90))
 
     with pytest.raises(UserError, match=r"a\.e57 is broken"):
-        contents(tmp_path / "a.e57")
+        contents(path)
+
+
+PARSERS = {
+    "a.e57": e57._parse,
+    "a.spz": splats._parse_spz,
+}
 
 
 @pytest.mark.parametrize(
-    ("name", "module", "extra"), [("a.e57", "pye57", "e57"), ("a.spz", "gsply", "splats")]
+    ("name", "module", "extra"),
+    [
+        ("a.e57", "pye57", "e57"),
+        ("a.spz", "gsply", "splats"),
+    ],
 )
 def test_missing_library_gets_one_line(name, module, extra, tmp_path, monkeypatch):
-    from mops_lightning.data.formats import e57, splats
-
     monkeypatch.setitem(sys.modules, module, None)
-    parse = e57._parse if name == "a.e57" else splats._parse_spz
+    parse = PARSERS[name]
 
     with pytest.raises(UserError, match=rf"{module}: pip install 'mops-lightning\[{extra}\]'"):
         parse(tmp_path / name)

@@ -33,6 +33,35 @@ def test_read_ptx_of_several_scans_numbers_them(tmp_path):
     assert table.points[3].tolist() == [0, 1, 0]
 
 
+WITHOUT_COLOURS = (
+    "1\n2\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n4 5 6 0.5\n7 8 9 0.75\n"
+)
+"""Two cells that have an intensity only."""
+
+
+def test_read_ptx_without_colours_has_intensities(tmp_path):
+    path = tmp_path / "a.ptx"
+    path.write_text(WITHOUT_COLOURS)
+
+    table = contents(path)
+
+    assert table.points.tolist() == [[4, 5, 6], [7, 8, 9]]
+    assert list(table.columns) == ["intensity"]
+    assert table.columns["intensity"].tolist() == [0.5, 0.75]
+
+
+@pytest.mark.parametrize("text", [SCAN + WITHOUT_COLOURS, WITHOUT_COLOURS + SCAN])
+def test_read_ptx_keeps_what_all_scans_have_and_names_the_rest(text, tmp_path):
+    path = tmp_path / "a.ptx"
+    path.write_text(text)
+
+    table = contents(path)
+
+    assert list(table.columns) == ["intensity", "scan"]
+    assert table.form.left_out == ("blue", "green", "red")
+    assert len(table.columns["intensity"]) == 6
+
+
 @pytest.mark.parametrize(
     ("row", "names"),
     [
@@ -40,6 +69,10 @@ def test_read_ptx_of_several_scans_numbers_them(tmp_path):
         ("1 2 3 -1200", ["intensity"]),
         ("1 2 3 10 20 30", ["red", "green", "blue"]),
         ("1 2 3 -1200 10 20 30", ["intensity", "red", "green", "blue"]),
+        (
+            "1 2 3 -1200 10 20 30 0 0.6 0.8",
+            ["intensity", "red", "green", "blue", "nx", "ny", "nz"],
+        ),
     ],
 )
 def test_read_pts_knows_columns_by_their_number(row, names, tmp_path):
@@ -47,8 +80,11 @@ def test_read_pts_knows_columns_by_their_number(row, names, tmp_path):
 
     table = contents(tmp_path / "a.pts")
 
+    values = [float(word) for word in row.split()]
+    found = [column[0] for column in table.columns.values()]
     assert table.points.tolist() == [[1, 2, 3]] * 3
     assert list(table.columns) == names
+    assert found == values[3:]
 
 
 def test_read_pts_of_several_blocks_is_one_cloud(tmp_path):

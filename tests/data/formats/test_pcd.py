@@ -33,21 +33,100 @@ def test_pcd_every_encoding_is_read(tmp_path):
     points = random.integers(0, 3, (40, 3)).astype("<f4")
     colour = np.repeat(np.arange(4, dtype="<u4"), 10)
     rows = np.empty(40, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
-    rows["x"], rows["y"], rows["z"], rows["rgb"] = *points.T, colour
-    text = "\n".join(" ".join(str(value) for value in row) for row in rows.tolist())
+    rows["x"] = points[:, 0]
+    rows["y"] = points[:, 1]
+    rows["z"] = points[:, 2]
+    rows["rgb"] = colour
+    lines = []
+    for row in rows.tolist():
+        words = [str(value) for value in row]
+        lines.append(" ".join(words))
+    text = "\n".join(lines)
     bodies = {"ascii": text.encode(), "binary": rows.tobytes()}
     for kind, body in bodies.items():
         path = tmp_path / f"{kind}.pcd"
-        path.write_bytes(f"# comment\nVERSION .7\n{HEAD}DATA {kind}\n".encode() + body)
+        head = f"# comment\nVERSION .7\n{HEAD}DATA {kind}\n"
+        path.write_bytes(head.encode() + body)
+
         table = pcd.read(path)
+
         assert_array_equal(table.points, points)
         assert_array_equal(table.columns["rgb"], colour)
+
+
+@pytest.mark.parametrize("height", ["HEIGHT 2\n", ""])
+def test_pcd_without_a_number_of_points_has_those_of_its_rows_and_columns(height, tmp_path):
+    number = 6 if height else 3
+    path = tmp_path / "a.pcd"
+    points = np.arange(3.0 * number, dtype="<f4").reshape(number, 3)
+    head = f"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 3\n{height}DATA binary\n"
+    path.write_bytes(head.encode() + points.tobytes())
+
+    table = contents(path)
+
+    assert_array_equal(table.points, points)
+
+
+PADDED_HEAD = (
+    "FIELDS x y z _ intensity _ ring\nSIZE 4 4 4 1 4 1 2\nTYPE F F F U F U U\n"
+    "COUNT 1 1 1 4 1 10 1\nWIDTH 3\nHEIGHT 1\nPOINTS 3\n"
+)
+"""The layout of PCL's points, with bytes between the fields that mean nothing."""
+
+
+def padded_rows():
+    rows = np.zeros(
+        3,
+        [
+            ("xyz", "<f4", 3),
+            ("first padding", "u1", 4),
+            ("intensity", "<f4"),
+            ("second padding", "u1", 10),
+            ("ring", "<u2"),
+        ],
+    )
+    rows["xyz"] = np.arange(9).reshape(3, 3)
+    rows["first padding"] = 1
+    rows["intensity"] = [0.5, 0.25, 8]
+    rows["second padding"] = 2
+    rows["ring"] = [7, 65535, 256]
+    return rows
+
+
+def stored_without_compression(content):
+    """Return an LZF stream of literals, with the two sizes before it."""
+    stream = b""
+    for start in range(0, len(content), 32):
+        literal = content[start : start + 32]
+        stream += bytes([len(literal) - 1]) + literal
+    return struct.pack("<II", len(stream), len(content)) + stream
+
+
+@pytest.mark.parametrize("kind", ["binary", "binary_compressed"])
+def test_pcd_bytes_between_fields_of_different_sizes_are_left_out(kind, tmp_path):
+    path = tmp_path / "a.pcd"
+    rows = padded_rows()
+    body = rows.tobytes()
+    if kind == "binary_compressed":  # one field after the other
+        x, y, z = rows["xyz"].T
+        later_fields = [rows[name] for name in rows.dtype.names[1:]]
+        fields = [np.ascontiguousarray(field).tobytes() for field in (x, y, z, *later_fields)]
+        body = stored_without_compression(b"".join(fields))
+    path.write_bytes(f"{PADDED_HEAD}DATA {kind}\n".encode() + body)
+
+    table = contents(path)
+
+    assert list(table.columns) == ["intensity", "ring"]
+    assert table.points.tolist() == [[0, 1, 2], [3, 4, 5], [6, 7, 8]]
+    assert table.columns["intensity"].tolist() == [0.5, 0.25, 8]
+    assert table.columns["ring"].tolist() == [7, 65535, 256]
 
 
 def test_pcd_impossible_count_is_broken(tmp_path):
     path = tmp_path / "a.pcd"
     head = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 1\nPOINTS 99999999999\nDATA ascii\n"
     path.write_text(head)
+
     with pytest.raises(UserError, match="bytes are not 99999999999 points"):
         contents(path)
 
@@ -91,7 +170,10 @@ def test_pcd_broken_compression_is_refused(tmp_path, body, message):
 def test_pcd_fields_of_several_numbers_are_kept(tmp_path):
     head = "FIELDS x y z fpfh\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 2\nWIDTH 3\nPOINTS 3\n"
     lines = "".join(f"{row} 0 0 {row}.5 {row}.25\n" for row in range(3))
-    (tmp_path / "a.pcd").write_text(f"{head}DATA ascii\n{lines}")
-    table = contents(tmp_path / "a.pcd")
+    path = tmp_path / "a.pcd"
+    path.write_text(f"{head}DATA ascii\n{lines}")
+
+    table = contents(path)
+
     assert list(table.columns) == ["fpfh_0", "fpfh_1"]
     assert table.columns["fpfh_1"].tolist() == [0.25, 1.25, 2.25]

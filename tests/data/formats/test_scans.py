@@ -16,8 +16,9 @@ NUSCENES = ("x", "y", "z", "intensity", "ring")
 def sweep():
     """400 points of five columns: 32 rings one after the other, as nuScenes has them."""
     random = np.random.default_rng(0)
+    unit = random.normal(size=(400, 3))
     rows = np.empty((400, 5), np.float32)
-    rows[:, :3] = random.normal(0, [20, 20, 1], (400, 3))
+    rows[:, :3] = unit * [20, 20, 1]
     rows[:, 3] = random.integers(0, 256, 400)
     rows[:, 4] = np.arange(400) % 32
     return rows
@@ -49,19 +50,69 @@ def test_read_bin_with_other_columns_asks_for_their_names(sweep, tmp_path):
 
 
 def test_read_bin_of_room_with_colours_is_refused(tmp_path):
+    path = tmp_path / "room.bin"
     random = np.random.default_rng(1)
-    rows = random.random((400, 6)) * [4, 4, 2.5, 255, 255, 255]
-    rows.astype(np.float32).tofile(tmp_path / "room.bin")
+    unit = random.random((400, 6), np.float32)
+    rows = unit * np.array([4, 4, 2.5, 255, 255, 255], np.float32)
+    rows.tofile(path)
 
     with pytest.raises(UserError, match="does not look like rows of x, y, z, intensity"):
-        contents(tmp_path / "room.bin")
+        contents(path)
 
 
 def test_read_bin_of_three_columns_is_refused_by_its_size(tmp_path):
-    np.ones((399, 3), np.float32).tofile(tmp_path / "a.bin")
+    path = tmp_path / "a.bin"
+    rows = np.ones((399, 3), np.float32)
+    rows.tofile(path)
 
     with pytest.raises(UserError, match=r"4788 bytes are not rows of 4 float32 .*--columns"):
-        contents(tmp_path / "a.bin")
+        contents(path)
+
+
+@pytest.mark.parametrize(("least", "is_refused"), [(0.0, False), (-0.25, True)])
+def test_read_bin_with_a_negative_intensity_asks_for_the_names(least, is_refused, tmp_path):
+    path = tmp_path / "a.bin"
+    rows = np.random.default_rng(0).random((20, 4), np.float32)
+    rows[13, 3] = least
+    rows.tofile(path)
+
+    if is_refused:
+        with pytest.raises(UserError, match=r"if these are right: --columns x,y,z,intensity"):
+            contents(path)
+    named = read(path, 9, 0, columns=("x", "y", "z", "intensity"))
+
+    assert named.columns["intensity"][13] == least
+    if not is_refused:
+        assert_array_equal(contents(path).points, named.points)
+
+
+@pytest.mark.parametrize(("number", "is_read"), [(31, True), (32, False)])
+def test_read_bin_of_few_points_is_not_judged(number, is_read, tmp_path):
+    """Five columns in a file of four: only with 32 points or more the numbers tell."""
+    path = tmp_path / "a.bin"
+    values = np.zeros(4 * number, np.float32)
+    values[::5] = 100
+    values.tofile(path)
+
+    if is_read:
+        assert len(contents(path).points) == number
+    else:
+        with pytest.raises(UserError, match="does not look like"):
+            contents(path)
+
+
+def test_label_file_beside_a_scan_comes_before_that_of_the_folder_of_labels(tmp_path):
+    scan = tmp_path / "velodyne" / "0.bin"
+    beside = tmp_path / "velodyne" / "0.label"
+    in_labels = tmp_path / "labels" / "0.label"
+    for path, label in ((beside, 5), (in_labels, 9)):
+        path.parent.mkdir()
+        np.full(40, label, "<u4").tofile(path)
+    np.ones((40, 4), np.float32).tofile(scan)
+
+    found = contents(scan).columns["label"]
+
+    assert found.tolist() == [5] * 40
 
 
 def rows_of_bin(path):
@@ -95,7 +146,7 @@ def test_read_label_file_gives_class_and_instance(scans, labels, tmp_path):
     label_file = tmp_path / labels / "000000.label"
     scan.parent.mkdir(exist_ok=True)
     label_file.parent.mkdir(exist_ok=True)
-    rows = np.random.default_rng(0).random((40, 4)).astype(np.float32)
+    rows = np.random.default_rng(0).random((40, 4), np.float32)
     rows.tofile(scan)
     classes = np.arange(40, dtype="<u4")
     instances = classes + 7
@@ -111,11 +162,12 @@ def test_read_label_file_gives_class_and_instance(scans, labels, tmp_path):
 
 
 def test_read_label_file_of_another_scan_is_refused(tmp_path):
-    np.ones((40, 4), np.float32).tofile(tmp_path / "a.bin")
+    scan = tmp_path / "a.bin"
+    np.ones((40, 4), np.float32).tofile(scan)
     np.ones(39, "<u4").tofile(tmp_path / "a.label")
 
     with pytest.raises(UserError, match=r"a\.label has 156 bytes, not 4 for each of the 40 points"):
-        contents(tmp_path / "a.bin")
+        contents(scan)
 
 
 @pytest.mark.parametrize("text", ["x,y", "x,y,z,", "x,y,z,z", "a b c"])

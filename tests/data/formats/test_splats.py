@@ -17,23 +17,30 @@ from tests.support.cloud_files import contents
 def splats():
     """300 splats with coefficients of the first degree."""
     random = np.random.default_rng(0)
-    quats = random.normal(size=(300, 4)).astype(np.float32)
+
+    def normal(*shape):
+        return random.standard_normal(shape, np.float32)
+
+    quats = normal(300, 4)
+    lengths = np.linalg.norm(quats, axis=1, keepdims=True)
     return gsply.GSData.from_arrays(
-        means=random.normal(size=(300, 3)).astype(np.float32),
-        scales=random.normal(-4, 0.5, (300, 3)).astype(np.float32),
-        quats=quats / np.linalg.norm(quats, axis=1, keepdims=True),
-        opacities=random.normal(size=300).astype(np.float32),
-        sh0=random.normal(0, 0.5, (300, 3)).astype(np.float32),
-        shN=random.normal(0, 0.2, (300, 3, 3)).astype(np.float32),
+        means=normal(300, 3),
+        scales=0.5 * normal(300, 3) - 4,
+        quats=quats / lengths,
+        opacities=normal(300),
+        sh0=0.5 * normal(300, 3),
+        shN=0.2 * normal(300, 3, 3),
     )
 
 
 def test_plain_splat_file_is_kept_exactly(splats, tmp_path):
-    gsply.plywrite(tmp_path / "a.ply", splats)
+    source = tmp_path / "a.ply"
+    copy = tmp_path / "b.ply"
+    gsply.plywrite(source, splats)
 
-    write(tmp_path / "b.ply", contents(tmp_path / "a.ply"))
+    write(copy, contents(source))
 
-    again = gsply.plyread(tmp_path / "b.ply")
+    again = gsply.plyread(copy)
     assert_array_equal(again.means, splats.means)
     assert_array_equal(again.shN, splats.shN)
     assert_array_equal(again.quats, splats.quats)
@@ -41,7 +48,8 @@ def test_plain_splat_file_is_kept_exactly(splats, tmp_path):
 
 @pytest.mark.parametrize("suffix", [".spz", ".compressed.ply"])
 def test_compressed_splats_equal_those_that_gsply_unpacks(suffix, splats, tmp_path):
-    packed, plain = tmp_path / f"a{suffix}", tmp_path / "plain.ply"
+    packed = tmp_path / f"a{suffix}"
+    plain = tmp_path / "plain.ply"
     if suffix == ".spz":
         gsply.write_spz(packed, splats)
         gsply.plywrite(plain, gsply.read_spz(packed))
@@ -62,10 +70,11 @@ def test_compressed_splats_equal_those_that_gsply_unpacks(suffix, splats, tmp_pa
 
 
 def test_splat_is_refused_with_a_converter(tmp_path):
-    (tmp_path / "a.splat").write_bytes(bytes(64))
+    path = tmp_path / "a.splat"
+    path.write_bytes(bytes(64))
 
     with pytest.raises(UserError, match=r"\.splat is not read. Convert it by SuperSplat"):
-        contents(tmp_path / "a.splat")
+        contents(path)
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGALRM"), reason="the system has no timer")

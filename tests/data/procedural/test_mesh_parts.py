@@ -20,22 +20,26 @@ def test_cushion_has_size_and_volume():
 
     mesh = mesh_parts.cushion((0, 2.0), (0, 1.0), (0, 1.5), radius)
 
-    low, high = mesh.bounds
-    assert np.allclose(low, (0, 0, 0))
-    assert np.allclose(high, (2.0, 1.0, 1.5))
+    assert has_bounds(mesh, (0, 0, 0), (2.0, 1.0, 1.5))
     assert 0.9 * volume < mesh.volume < volume
 
 
 def test_rod_has_volume_of_a_cylinder():
     rod = mesh_parts.rod((1, 2, 3), (1, 5, 3), 0.5, sections=64)
 
-    assert rod.volume == pytest.approx(3 * np.pi * 0.25, rel=0.01)
+    expected = 3 * np.pi * 0.25
+    assert rod.volume == pytest.approx(expected, rel=0.01)
+
+
+def has_bounds(mesh, low, high):
+    """Whether a mesh reaches from one corner to the other."""
+    return np.allclose(mesh.bounds, [low, high])
 
 
 def test_rod_of_four_sections_fills_its_square():
     rod = mesh_parts.rod((0, 0, 0), (0, 2, 0), 0.5, sections=4)
 
-    assert np.allclose(rod.bounds, [[-0.5, 0, -0.5], [0.5, 2, 0.5]])
+    assert has_bounds(rod, (-0.5, 0, -0.5), (0.5, 2, 0.5))
 
 
 def test_tube_has_volume_of_a_torus():
@@ -53,12 +57,19 @@ def test_tube_has_volume_of_a_torus():
 def test_box_fills_spans():
     box = mesh_parts.box((0, 1), (2, 4), (-3, 0))
 
-    assert np.allclose(box.bounds, [[0, 2, -3], [1, 4, 0]])
+    assert has_bounds(box, (0, 2, -3), (1, 4, 0))
 
 
 def test_loft_of_squares_is_block():
-    square = np.array([(0, 0, 0), (0, 1, 0), (1, 1, 0), (1, 0, 0)])
-    opposite = square + np.array((0, 0, 3))
+    square = np.array(
+        [
+            (0, 0, 0),
+            (0, 1, 0),
+            (1, 1, 0),
+            (1, 0, 0),
+        ]
+    )
+    opposite = square + np.array([0, 0, 3])
 
     block = mesh_parts.loft((square, opposite))
 
@@ -67,19 +78,28 @@ def test_loft_of_squares_is_block():
 
 
 def test_turned_is_surface_of_revolution():
-    mesh = mesh_parts.turned([(1, 0), (1, 3)], sections=64)
+    profile = [(1, 0), (1, 3)]
 
-    assert np.allclose(mesh.bounds, [[-1, 0, -1], [1, 3, 1]])
-    assert mesh.area == pytest.approx(6 * np.pi, rel=0.01)
+    mesh = mesh_parts.turned(profile, sections=64)
+
+    expected = 6 * np.pi
+    assert has_bounds(mesh, (-1, 0, -1), (1, 3, 1))
+    assert mesh.area == pytest.approx(expected, rel=0.01)
 
 
 def test_smooth_interpolates_without_overshoot():
-    corners = [(1, 0), (3, 1), (0.5, 2)]
+    corners = [
+        (1, 0),
+        (3, 1),
+        (0.5, 2),
+    ]
 
     curve = mesh_parts.smooth(corners, steps=50)
 
-    assert np.allclose(curve[0], (1, 0))
-    assert np.allclose(curve[-1], (0.5, 2))
+    first = curve[0]
+    last = curve[-1]
+    assert np.allclose(first, (1, 0))
+    assert np.allclose(last, (0.5, 2))
     radii = curve[:, 0]
     assert radii.min() >= 0.5
     assert radii.max() <= 3
@@ -91,5 +111,6 @@ def test_join_keeps_all_faces():
 
     mesh = mesh_parts.join([box, rod])
 
-    assert mesh.area == pytest.approx(box.area + rod.area)
+    together = box.area + rod.area
+    assert mesh.area == pytest.approx(together)
     assert mesh.bounds[1, 0] > 5

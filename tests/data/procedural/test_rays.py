@@ -11,7 +11,9 @@ from tests.support.clouds import normal_points
 
 @pytest.fixture
 def camera():
-    return Camera.looking_at(np.array([0.0, 0.1, 0.0]), np.array([2.0, 1.0, 1.5]))
+    aim = np.array([0.0, 0.1, 0.0])
+    place = np.array([2.0, 1.0, 1.5])
+    return Camera.looking_at(aim, place)
 
 
 @pytest.fixture
@@ -20,7 +22,8 @@ def triangles(camera):
     ball = trimesh.creation.icosphere(2, 0.4)
     box = trimesh.creation.box((0.5, 0.5, 2.0))
     box.apply_translation((-1.0, 0, 0))
-    return camera.seen(np.concatenate([ball.triangles, box.triangles]))
+    both = np.concatenate([ball.triangles, box.triangles])
+    return camera.seen(both)
 
 
 def one_ray(triangles, direction):
@@ -31,7 +34,8 @@ def one_ray(triangles, direction):
         if abs(np.linalg.det(system)) < 1e-12:
             continue
         along_second, along_third, depth = np.linalg.solve(system, -first)
-        if along_second >= 0 and along_third >= 0 and along_second + along_third <= 1:
+        is_inside = min(along_second, along_third, 1 - along_second - along_third) >= 0
+        if is_inside:
             nearest = min(nearest, (depth, row))
     return nearest
 
@@ -55,7 +59,8 @@ def test_nearest_faces_are_those_of_one_ray_after_the_other(triangles):
 
 
 def test_nearest_faces_in_groups_are_those_at_once(triangles, monkeypatch):
-    grid = RayGrid.around(triangles.reshape(-1, 3), 30, np.array([0.5, 0.5]))
+    corners = triangles.reshape(-1, 3)
+    grid = RayGrid.around(corners, 30, np.array([0.5, 0.5]))
     depths, faces = nearest_faces(triangles, grid)
     monkeypatch.setattr(rays, "MOST_PAIRS", 10)
 
@@ -73,7 +78,8 @@ def test_nearest_faces_ray_on_a_shared_edge_meets_a_triangle():
         ],
         float,
     )
-    grid = RayGrid(across=np.array([0.0, 0.25]), up=np.array([0.0, 0.25]))
+    ticks = np.array([0.0, 0.25])
+    grid = RayGrid(across=ticks, up=ticks)
 
     depths, faces = nearest_faces(square, grid)
 
@@ -82,7 +88,13 @@ def test_nearest_faces_ray_on_a_shared_edge_meets_a_triangle():
 
 
 def test_nearest_faces_miss_what_is_beside_the_grid():
-    triangle = np.array([[5.0, 5.0, 1.0], [6.0, 5.0, 1.0], [5.0, 6.0, 1.0]])
+    triangle = np.array(
+        [
+            [5.0, 5.0, 1.0],
+            [6.0, 5.0, 1.0],
+            [5.0, 6.0, 1.0],
+        ]
+    )
     ticks = np.array([-1.0, 0.0, 1.0])
     grid = RayGrid(across=ticks, up=ticks)
 
@@ -96,8 +108,9 @@ def test_camera_turns_points_there_and_back(camera):
     points = normal_points(20, 0)
 
     seen = camera.seen(points)
+    back = camera.world(seen)
 
-    assert camera.world(seen) == pytest.approx(points)
+    assert back == pytest.approx(points)
 
 
 def test_camera_has_orthonormal_axes_and_sees_its_aim_in_the_middle_and_upright(camera):
@@ -105,7 +118,8 @@ def test_camera_has_orthonormal_axes_and_sees_its_aim_in_the_middle_and_upright(
 
     x, y, _ = camera.seen(aim)
 
-    assert camera.axes @ camera.axes.T == pytest.approx(np.eye(3))
+    products = camera.axes @ camera.axes.T
+    assert products == pytest.approx(np.eye(3))
     assert x == pytest.approx(0)
     assert y == pytest.approx(0)
     _, up, _ = camera.axes

@@ -41,8 +41,7 @@ def read(path: Path) -> Table:
     """Read a PCD file; a field with a COUNT of k becomes k columns."""
     data = path.read_bytes()
     header, start = _header(data)
-    number_words = header.get("POINTS", header["WIDTH"])
-    number = int(number_words[0])
+    number = _number_of_points(header)
     if number < 1:
         raise BadCloudError(f"{path} holds no points.")
     layout = _layout(header)
@@ -62,6 +61,15 @@ def read(path: Path) -> Table:
     table = from_columns(columns, path, PcdForm(viewpoint))
     form = replace(table.form, arrays=grouped)
     return replace(table, form=form)
+
+
+def _number_of_points(header: dict[str, list[str]]) -> int:
+    """Return the number of points; without POINTS, that of the rows and columns of the scan."""
+    if "POINTS" in header:
+        return int(header["POINTS"][0])
+    width = int(header["WIDTH"][0])
+    height = int(header.get("HEIGHT", ["1"])[0])
+    return width * height
 
 
 def _layout(header: dict[str, list[str]]) -> np.dtype[Any]:
