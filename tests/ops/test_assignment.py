@@ -15,7 +15,9 @@ RECORDED = [218.255914, 210.018198, 208.054227, 207.526908, 206.56343]
 
 def clouds(n, seed=0):
     rng = np.random.default_rng(seed)
-    return rng.normal(size=(n, 3)), rng.normal(size=(n, 3)) * [1, 2, 0.5]
+    p = rng.normal(size=(n, 3))
+    q = rng.normal(size=(n, 3))
+    return p, q * [1, 2, 0.5]
 
 
 def cost(p, q, rows):
@@ -39,16 +41,23 @@ def solved(monkeypatch):
 def test_solve_by_either_solver_is_exact(limit, monkeypatch):
     monkeypatch.setattr(assignment, "NETWORK_SIMPLEX_MIN_POINTS", limit)
     p, q = clouds(70)
+
     rows = solve_assignment(p, q)
+
+    _, expected = linear_sum_assignment(cdist(p, q))
     assert rows.dtype == np.int64
-    assert np.array_equal(rows, linear_sum_assignment(cdist(p, q))[1])
+    assert np.array_equal(rows, expected)
 
 
 def test_solve_of_plan_that_is_no_bijection_is_exact(monkeypatch):
     monkeypatch.setattr(assignment, "NETWORK_SIMPLEX_MIN_POINTS", 1)
     monkeypatch.setattr(ot, "emd", lambda a, b, cost, **_: np.ones_like(cost))
     p, q = clouds(20)
-    assert np.array_equal(solve_assignment(p, q), linear_sum_assignment(cdist(p, q))[1])
+
+    rows = solve_assignment(p, q)
+
+    _, expected = linear_sum_assignment(cdist(p, q))
+    assert np.array_equal(rows, expected)
 
 
 @pytest.mark.parametrize(
@@ -78,13 +87,20 @@ def test_approximate_solves_blocks_that_cover_all_points_in_every_round(n, sizes
 
 def test_approximate_cost_never_increases_and_is_fixed():
     p, q = clouds(200)
-    costs = [cost(p, q, approximate_assignment(p, q, 32, rounds)) for rounds in range(5)]
+
+    costs = []
+    for rounds in range(5):
+        rows = approximate_assignment(p, q, 32, rounds)
+        costs.append(cost(p, q, rows))
+
     assert costs == sorted(costs, reverse=True)
     assert costs == pytest.approx(RECORDED, rel=1e-6)
 
 
 def test_approximate_in_one_block_is_exact(solved):
     p, q = clouds(40)
+
     rows = approximate_assignment(p, q, 40, 5)
+
     assert len(solved) == 1
     assert np.array_equal(rows, solve_assignment(p, q))

@@ -66,27 +66,48 @@ def test_nearest_equals_torch_form(m, n, kind, dtype, rng, both):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(("m", "n", "k"), [(1, 2, 2), (70, 9, 9), (30, 800, 16), (5, 130, 33)])
+@pytest.mark.parametrize(
+    ("m", "n", "k"),
+    [
+        (1, 2, 2),
+        (70, 9, 9),
+        (30, 800, 16),
+        (5, 130, 33),
+    ],
+)
 def test_neighbours_equal_torch_form(m, n, k, kind, dtype, rng):
     points, queries = points_and_queries(kind, n, m, dtype, rng)
 
     _, rows = k_nearest(queries, points, k)
     rows_by_blocks = search_in_blocks(queries, points, k)
 
-    squared = torch.zeros(2, m, n, dtype=dtype)
-    for axis in range(3):
-        difference = points[:, None, :, axis] - queries[:, :, None, axis]
-        squared.addcmul_(difference, difference)
+    squared = squared_distances(queries, points)
     _, in_order = squared.sort(stable=True)
-    assert torch.equal(rows, in_order[..., :k])
     distances = squared.gather(2, rows)
-    assert torch.equal(squared.gather(2, rows_by_blocks), distances)
+    distances_by_blocks = squared.gather(2, rows_by_blocks)
+    assert torch.equal(rows, in_order[..., :k])
+    assert torch.equal(distances_by_blocks, distances)
+
+
+def squared_distances(queries, points):
+    """Return all squared distances ``(B, M, N)``, added up in the order of the axes."""
+    shape = (*queries.shape[:2], points.shape[1])
+    squared = torch.zeros(shape, dtype=points.dtype)
+    for axis in range(3):
+        of_queries = queries[:, :, None, axis]
+        of_points = points[:, None, :, axis]
+        difference = of_points - of_queries
+        squared.addcmul_(difference, difference)
+    return squared
 
 
 def test_nearest_of_centre_equals_torch_form(rng, both):
     """All points are almost equally far away, so that no box can be skipped."""
     points = cloud_of("sphere", (1, 500), torch.float32, rng)
-    fast, plain = both(nearest_points, torch.zeros(1, 20, 3), points)
+    centres = torch.zeros(1, 20, 3)
+
+    fast, plain = both(nearest_points, centres, points)
+
     assert torch.equal(fast[1], plain[1])
 
 
@@ -122,19 +143,33 @@ def test_nearest_non_contiguous_equals_torch_form(dtype, rand, both):
 def test_nearest_gradients_equal_torch_form(rand, both):
     points = rand(1, 60, 3, requires_grad=True)
     queries = rand(1, 50, 3)
-    fast, plain = both(
-        lambda: torch.autograd.grad(nearest_points(queries, points)[0].sum(), points)
-    )
-    assert torch.equal(fast[0], plain[0])
+
+    def gradient():
+        distances, _ = nearest_points(queries, points)
+        return torch.autograd.grad(distances.sum(), points)
+
+    (fast,), (plain,) = both(gradient)
+
+    assert torch.equal(fast, plain)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(("n", "m"), [(1, 1), (90, 90), (128, 60), (1500, 700)])
+@pytest.mark.parametrize(
+    ("n", "m"),
+    [
+        (1, 1),
+        (90, 90),
+        (128, 60),
+        (1500, 700),
+    ],
+)
 def test_farthest_equals_torch_form(n, m, kind, dtype, rng, both):
     points = cloud_of(kind, (2, n), dtype, rng)
     start = torch.randint(n, (2,), generator=rng)
+
     fast, plain = both(farthest_point_sample, points, m, start=start)
+
     assert torch.equal(fast, plain)
 
 
@@ -171,7 +206,10 @@ ODD: dict[str, Callable[[], torch.Tensor]] = {
 @pytest.mark.parametrize("kind", ODD)
 def test_farthest_of_odd_points_equals_torch_form(kind, both):
     points = ODD[kind]()
-    fast, plain = both(farthest_point_sample, points, 200, start=torch.arange(len(points)))
+    start = torch.arange(len(points))
+
+    fast, plain = both(farthest_point_sample, points, 200, start=start)
+
     assert torch.equal(fast, plain)
 
 
@@ -180,7 +218,9 @@ def test_farthest_in_threads_equals_torch_form(threads, rand, both, monkeypatch)
     monkeypatch.setattr(farthest, "THREADS_MIN_WORK", 1)
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
     points = rand(5, 300, 3)
+
     fast, plain = both(farthest_point_sample, points, 100)
+
     assert torch.equal(fast, plain)
 
 

@@ -12,9 +12,12 @@ KINDS = ["sphere", "grid", "copies", "one point", "offset", "tiny", "huge", "out
 
 
 def scrambled(key):
-    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB), (31, 1)):
-        key = (key ^ key >> shift) * factor % WORD
-    return key
+    """The finalizer of SplitMix64."""
+    key ^= key >> 30
+    key = key * 0xBF58476D1CE4E5B9 % WORD
+    key ^= key >> 27
+    key = key * 0x94D049BB133111EB % WORD
+    return key ^ key >> 31
 
 
 def plain_keys(points, seed):
@@ -24,10 +27,13 @@ def plain_keys(points, seed):
     for cloud in hashes.tolist():
         copies = dict.fromkeys(cloud, 0)
         keys = []
-        for key in cloud:
-            copy = copies[key]
-            copies[key] += 1
-            keys.append(scrambled((key + copy * STEP) % WORD) if copy else key % WORD)
+        for hash_of_point in cloud:
+            copy = copies[hash_of_point]
+            copies[hash_of_point] += 1
+            key = hash_of_point % WORD
+            if copy > 0:
+                key = scrambled((key + copy * STEP) % WORD)
+            keys.append(key)
         rows.append(keys)
     return np.array(rows, np.uint64).view(np.int64)
 
@@ -40,8 +46,9 @@ def test_keys_equal_plain_form(kind, number, dtype, rng):
 
     keys = seeded_keys(points.numpy(), SeededOrder(11))
 
-    assert (keys == plain_keys(points, 11)).all()
-    assert torch.equal(torch.from_numpy(keys), _keys_on_device(points, 11))
+    keys_in_torch = _keys_on_device(points, 11)
+    assert np.array_equal(keys, plain_keys(points, 11))
+    assert np.array_equal(keys, keys_in_torch)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -73,7 +80,11 @@ def test_unit_spheres_have_the_exact_mean_in_any_order(randn):
 
 
 def test_unit_sphere_of_equal_points_has_radius_1():
-    assert unit_spheres(np.full((1, 4, 3), 0.5)).tolist() == [[0.5, 0.5, 0.5, 1.0]]
+    equal = np.full((1, 4, 3), 0.5)
+
+    (sphere,) = unit_spheres(equal)
+
+    assert sphere.tolist() == [0.5, 0.5, 0.5, 1.0]
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

@@ -46,7 +46,8 @@ def test_sampled_points_keep_their_values(k, rng, rand):
     chosen = torch.randperm(80, generator=rng)[:20]
     scores = rand(20, 4)
 
-    carried = propagate(scores, propagation_map(points, points[chosen], k))
+    made = propagation_map(points, points[chosen], k)
+    carried = propagate(scores, made)
 
     assert torch.equal(carried[chosen], scores)
 
@@ -54,17 +55,21 @@ def test_sampled_points_keep_their_values(k, rng, rand):
 def test_ragged_clouds_equal_clouds_one_by_one(rng, rand):
     first = rand(40, 3)
     second = rand(25, 3)
+    sample_of_first = first[:8]
+    sample_of_second = second[:6]
     labels = torch.randint(9, (14,), generator=rng)
     points = torch.cat([first, second])
-    batch = torch.arange(2).repeat_interleave(torch.tensor([40, 25]))
-    sampled = torch.cat([first[:8], second[:6]])
-    sampled_batch = torch.arange(2).repeat_interleave(torch.tensor([8, 6]))
+    batch = torch.tensor([0] * 40 + [1] * 25)
+    sampled = torch.cat([sample_of_first, sample_of_second])
+    sampled_batch = torch.tensor([0] * 8 + [1] * 6)
 
     flat = propagation_map(points, sampled, 3, batch, sampled_batch)
+    carried = propagate(labels, flat)
 
-    of_first = propagate(labels[:8], propagation_map(first, first[:8], 3))
-    of_second = propagate(labels[8:], propagation_map(second, second[:6], 3))
-    assert torch.equal(propagate(labels, flat), torch.cat([of_first, of_second]))
+    map_of_first = propagation_map(first, sample_of_first, 3)
+    map_of_second = propagation_map(second, sample_of_second, 3)
+    assert torch.equal(carried[:40], propagate(labels[:8], map_of_first))
+    assert torch.equal(carried[40:], propagate(labels[8:], map_of_second))
 
 
 @pytest.mark.parametrize("cloud", [0, 1])
@@ -73,7 +78,8 @@ def test_batch_equals_clouds_one_by_one(cloud, rand):
     samples = rand(2, 6, 3)
     values = rand(2, 6, 5)
 
-    carried = propagate(values, propagation_map(points, samples, 2))
+    made = propagation_map(points, samples, 2)
+    carried = propagate(values, made)
 
     map_alone = propagation_map(points[cloud], samples[cloud], 2)
     carried_alone = propagate(values[cloud], map_alone)
@@ -115,13 +121,20 @@ def test_columns_vote_one_by_one_and_colours_are_averaged_on_request():
 
 
 def test_vote_that_is_tied_is_won_by_the_nearer_point_and_among_equals_by_the_lowest_row():
-    sampled = np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 2.0, 0], [0, -2.0, 0]])
-    equally_far = np.zeros((1, 3))
-    near_one = PropagationMap(torch.tensor([[1, 0, 2]]), torch.tensor([[0.5, 0.25, 0.25]]), 4)
+    sampled = np.zeros((4, 3))
+    sampled[0, 0] = 1
+    sampled[1, 0] = -1
+    sampled[2, 1] = 2
+    sampled[3, 1] = -2
+    origin = np.zeros((1, 3))
+    equally_far = propagation_map(origin, sampled, 2)
+    rows = torch.tensor([[1, 0, 2]])
+    weights = torch.tensor([[0.5, 0.25, 0.25]])
+    one_is_nearer = PropagationMap(rows, weights, 4)
     labels = np.array([7, 3, 7, 5])
 
-    voted = propagate(labels, propagation_map(equally_far, sampled, 2))
-    voted_by_the_nearer = propagate(labels, near_one)
+    voted = propagate(labels, equally_far)
+    voted_by_the_nearer = propagate(labels, one_is_nearer)
 
     assert voted.tolist() == [7]
     assert voted_by_the_nearer.tolist() == [3]
@@ -265,10 +278,13 @@ def exact_mean(values, weights):
 
 @pytest.mark.parametrize("kind", [np.int64, np.uint64])
 def test_mean_of_64_bits_does_not_wrap(kind):
-    info = np.iinfo(kind)
-    values = np.array([info.max, info.max - 1, info.min, info.min + 2, 2**60 + 1], kind)
-    rows = torch.tensor([[0, 1], [1, 0], [2, 3], [0, 2], [3, 1], [4, 0]])
+    largest = np.iinfo(kind).max
+    smallest = np.iinfo(kind).min
+    values = np.array([largest, largest - 1, smallest, smallest + 2, 2**60 + 1], kind)
+    first_row = torch.tensor([0, 1, 2, 0, 3, 4])
+    second_row = torch.tensor([1, 0, 3, 2, 1, 0])
     first_weight = torch.tensor([0.5, 0.75, 0.5, 0.5, 0.25, 1.0])
+    rows = torch.stack([first_row, second_row], dim=1)
     weights = torch.stack([first_weight, 1 - first_weight], dim=1)
     made = PropagationMap(rows, weights, 5)
 
@@ -285,7 +301,9 @@ def test_mean_of_64_bits_does_not_wrap(kind):
 @pytest.mark.parametrize("kind", [np.uint16, np.uint32, np.uint64, np.int64, np.float32])
 @pytest.mark.parametrize("k", [1, 2])
 def test_fill_is_the_value_of_points_without_coordinates(kind, k):
-    largest = 9 if kind is np.float32 else np.iinfo(kind).max
+    largest = 9
+    if kind is not np.float32:
+        largest = np.iinfo(kind).max
     values = np.array([5, 6, largest], kind)
     rows = torch.tensor([[0, 1], [-1, -1], [2, 1]])
     weights = torch.full((3, k), 1 / k)
@@ -300,10 +318,12 @@ def test_fill_is_the_value_of_points_without_coordinates(kind, k):
 
 
 def test_fill_that_the_type_cannot_hold_is_refused():
-    made = PropagationMap(torch.tensor([[0], [-1]]), torch.ones(2, 1), 1)
+    rows = torch.tensor([[0], [-1]])
+    made = PropagationMap(rows, torch.ones(2, 1), 1)
+    values = np.array([5], np.uint16)
 
     with pytest.raises(UserError, match=r"fill must be a number of the type torch.uint16, got -1"):
-        propagate(np.array([5], np.uint16), made, fill=-1)
+        propagate(values, made, fill=-1)
 
 
 def test_map_file_with_big_endian_arrays_is_read(tmp_path):

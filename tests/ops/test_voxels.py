@@ -33,8 +33,13 @@ def plain_voxels(points, size):
     means = {}
     for cell, members in rows.items():
         exact = [in_voxels(points[row], size) for row in members]
-        means[cell] = [sum(axis) / len(members) for axis in zip(*exact, strict=True)]
+        x, y, z = zip(*exact, strict=True)
+        means[cell] = [exact_mean(x), exact_mean(y), exact_mean(z)]
     return rows, means
+
+
+def exact_mean(fractions):
+    return sum(fractions) / len(fractions)
 
 
 def cell_of(point, size):
@@ -69,7 +74,8 @@ def test_representatives_equal_plain_twin(cloud, size):
 
 
 def test_representatives_tie_takes_lowest_coordinates():
-    points = np.array([[0.75, 0.5, 0.5], [0.25, 0.5, 0.5], [0.25, 0.5, 0.5]])
+    points = np.full((3, 3), 0.5)
+    points[:, 0] = [0.75, 0.25, 0.25]
 
     rows = representatives(points, 1.0).rows
 
@@ -95,11 +101,16 @@ def test_representatives_weight_takes_heaviest_then_nearest():
 @pytest.mark.parametrize("cloud", CLOUDS)
 def test_representatives_any_order_of_points_gives_the_same(cloud):
     points = CLOUDS[cloud]
-    expected = {tuple(point) for point in points[representatives(points, 0.3).rows]}
+    expected = representative_points(points)
 
     for seed in range(5):
         shuffled = np.random.default_rng(seed).permutation(points)
-        assert {tuple(p) for p in shuffled[representatives(shuffled, 0.3).rows]} == expected
+        assert representative_points(shuffled) == expected
+
+
+def representative_points(points):
+    rows = representatives(points, 0.3).rows
+    return {tuple(point) for point in points[rows]}
 
 
 @pytest.mark.parametrize("cloud", CLOUDS)
@@ -123,7 +134,10 @@ def test_means_are_exact_to_a_billionth_of_a_voxel():
 
     voxels = occupied(points, 0.75)
 
-    expected = [[float(axis * Fraction(0.75)) for axis in means[place]] for place in sorted(means)]
+    expected = []
+    for place in sorted(means):
+        mean = [float(axis * Fraction(0.75)) for axis in means[place]]
+        expected.append(mean)
     np.testing.assert_allclose(voxels.means(0.75), expected, rtol=0, atol=2e-9)
 
 
@@ -138,5 +152,7 @@ def test_many_voxels_are_counted():
 
 
 def test_too_small_voxels_are_refused():
+    points = np.array([[5e6, 0.0, 0.0]])
+
     with pytest.raises(UserError, match="voxel: 1e-12 is too small for coordinates of up to 5e"):
-        occupied(np.array([[5e6, 0.0, 0.0]]), 1e-12)
+        occupied(points, 1e-12)
