@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 from mops_lightning.config import settings
 from mops_lightning.config.declaration import Setting
 from mops_lightning.config.explain import no_such_setting
-from mops_lightning.config.groups import choice_groups
+from mops_lightning.config.groups import choice_groups, is_choice, keys_of_files
 from mops_lightning.config.overrides import key as key_of
 from mops_lightning.config.overrides import parse_override
 from mops_lightning.errors import UserError
@@ -33,7 +33,7 @@ OTHERWISE = {
 def check_overrides(arguments: Sequence[str]) -> None:
     """Refuse ``logger=null`` and the like: Hydra's error has no key, or there is none.
 
-    A mistyped key of the top level is refused here, too: Hydra composes twice before it says so.
+    A mistyped key is refused here, too, if no file sets it: Hydra composes twice before it says so.
 
     Raises:
         UserError: there is no key, an unknown one, or a group of choices is set to something else
@@ -53,6 +53,42 @@ def check_overrides(arguments: Sequence[str]) -> None:
         _check(argument, name, override, groups)
         if top not in known and _is_change(override) and not has_flags:
             raise UserError(no_such_setting(name, arguments))
+    if not has_flags:
+        _check_inner_keys(arguments, groups)
+
+
+def _check_inner_keys(arguments: Sequence[str], groups: list[str]) -> None:
+    """Refuse a key such as ``sampler.alhpa``, unless other arguments or files could set it.
+
+    Raises:
+        UserError: no file of ``conf/`` has the key.
+    """
+    overrides = [parse_override(argument) for argument in arguments]
+    given = [override for override in overrides if override is not None]
+    if any(_may_bring_keys(override, groups) for override in given):
+        return
+    for override in given:
+        parts = override.key_or_group.split(".")
+        if parts[0] == "hydra" or not _is_change(override):
+            continue
+        for depth, part in enumerate(parts, 1):
+            is_index = part.isdecimal()
+            if not is_index and part not in keys_of_files():
+                raise UserError(no_such_setting(".".join(parts[:depth]), arguments))
+
+
+def _may_bring_keys(override: "Override", groups: list[str]) -> bool:
+    """Return whether an override can set keys that no file of ``conf/`` has."""
+    name = override.key_or_group
+    is_addition = override.is_add() or override.is_force_add()
+    if is_addition or name.startswith("hydra") or name.endswith("._target_"):
+        return True
+    if override.is_delete():
+        return False
+    value: Any = override.value()
+    if name in groups:
+        return not is_choice(name, str(value))
+    return isinstance(value, dict)
 
 
 def _is_change(override: "Override") -> bool:

@@ -1,11 +1,16 @@
 """The folder ``conf/`` and its groups of choices, such as ``task/net``."""
 
+import re
+from functools import cache
 from pathlib import Path
 
 from mops_lightning.config import settings
 
 PRESETS = ("experiment", "debug")
 """Groups of presets, which are no settings themselves."""
+
+KEY = re.compile(r"(\w+)['\"]?\s*:")
+"""A key in a YAML file; also some words in comments, which does no harm."""
 
 
 def conf_dir() -> Path:
@@ -39,3 +44,17 @@ def is_offered(group: str) -> bool:
     top = group.partition("/")[0]
     is_named = top in settings.declared() or top in PRESETS
     return is_named and not (conf_dir() / f"{group}.yaml").is_file()
+
+
+def is_choice(group: str, name: str) -> bool:
+    """Return whether a file of ``conf/`` describes a choice of a group."""
+    return (conf_dir() / group / f"{name}.yaml").is_file()
+
+
+@cache
+def keys_of_files() -> frozenset[str]:
+    """Return all keys, at any depth, that the files of ``conf/`` and the declaration set."""
+    keys = set(settings.declared())
+    for path in conf_dir().rglob("*.yaml"):
+        keys.update(KEY.findall(path.read_text(encoding="utf-8")))
+    return frozenset(keys)

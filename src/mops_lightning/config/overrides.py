@@ -1,6 +1,6 @@
 """Reading overrides such as ``++task/net@task.net=pcrnet`` with Hydra's own parser."""
 
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -123,6 +123,7 @@ def _quoted(argument: str) -> str:
     return f"{name}{sign}{quote(value)}"
 
 
+@lru_cache(maxsize=4096)  # several checks read the same arguments, and the parser is slow
 def _parsed(argument: str) -> "Override | None":
     from hydra.errors import HydraException
 
