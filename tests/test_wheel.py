@@ -15,6 +15,8 @@ ROOT = Path(__file__).parents[1]
 # .gitignore too: hatchling leaves out of the wheel what git ignores.
 SOURCES = ("pyproject.toml", "README.md", "LICENSE", ".gitignore", "src", "conf", "sweeps")
 TINY_JOB = "learn=task dataset=shapes dataset.train_per_class=4 dataset.test_per_class=2"
+# An installed copy compiles its loops anew; these sampled points need none.
+NO_LOOPS = "sampler=random baselines={}"
 TINY_SIZES = "dataset.n_points=64 batch_size=16 m=8 trainer=cpu trainer.max_epochs=1"
 
 
@@ -84,7 +86,7 @@ def test_run_of_installed_copy_leaves_a_record(installed: Path, tmp_path: Path) 
     elsewhere = tmp_path / "empty"
     elsewhere.mkdir()
     folders = (f"out={tmp_path / 'out'}", f"cache={tmp_path / 'cache'}")
-    job = [*TINY_JOB.split(), *TINY_SIZES.split(), *folders]
+    job = [*TINY_JOB.split(), *TINY_SIZES.split(), *NO_LOOPS.split(), *folders]
     python("-m", "mops_lightning", *job, cwd=elsewhere, path=installed)
     (result,) = (tmp_path / "out").rglob("result.json")
     record = json.loads(result.read_text())

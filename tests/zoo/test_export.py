@@ -51,19 +51,6 @@ def test_exported_program_takes_more_points_than_s_has_entries_in_one_piece(shap
         assert torch.allclose(generated, sampler(points).points, atol=1e-5)
 
 
-def test_onnx_file_names_its_axes(tmp_path):
-    pytest.importorskip("onnxscript", reason="extra onnx")
-    onnxruntime = pytest.importorskip("onnxruntime", reason="extra onnx")
-
-    export(FMOPSNet(12, **SMALL).eval(), tmp_path / "net.onnx", 5)
-
-    session = onnxruntime.InferenceSession(tmp_path / "net.onnx")
-    (points,) = session.get_inputs()
-    (generated,) = session.get_outputs()
-    assert (points.name, points.shape) == ("points", ["batch", "points", 3])
-    assert (generated.name, generated.shape) == ("generated", ["batch", 5, 3])
-
-
 def test_onnx_file_equals_the_model_at_any_size(tmp_path):
     pytest.importorskip("onnxscript", reason="extra onnx")
     onnxruntime = pytest.importorskip("onnxruntime", reason="extra onnx")
@@ -113,16 +100,32 @@ def test_exported_anchored_program_equals_the_sampler_from_the_least_number(
         program(clouds(1, least - 1))
 
 
-def test_onnx_file_of_local_columns_equals_the_sampler_and_refuses_too_few_points(tmp_path):
+@pytest.fixture(scope="module")
+def local_columns(tmp_path_factory):
+    """An FMOPS-Net with local columns, and a session with its ONNX file for 5 points."""
     pytest.importorskip("onnxscript", reason="extra onnx")
     onnxruntime = pytest.importorskip("onnxruntime", reason="extra onnx")
     sampler = anchored(candidates=8, neighbours=6)
-
-    export(sampler, tmp_path / "net.onnx", 5)
-
+    path = tmp_path_factory.mktemp("onnx") / "net.onnx"
+    export(sampler, path, 5)
     options = onnxruntime.SessionOptions()
-    options.log_severity_level = 4  # the refusal is also logged
-    session = onnxruntime.InferenceSession(tmp_path / "net.onnx", options)
+    options.log_severity_level = 4  # a refusal is also logged
+    return sampler, onnxruntime.InferenceSession(path, options)
+
+
+def test_onnx_file_names_its_axes(local_columns):
+    _, session = local_columns
+
+    (points,) = session.get_inputs()
+    (generated,) = session.get_outputs()
+
+    assert (points.name, points.shape) == ("points", ["batch", "points", 3])
+    assert (generated.name, generated.shape) == ("generated", ["batch", 5, 3])
+
+
+def test_onnx_file_of_local_columns_equals_the_sampler_and_refuses_too_few_points(local_columns):
+    sampler, session = local_columns
+
     for shape in ((1, 96), (3, 200)):
         points = clouds(*shape)
         (generated,) = session.run(["generated"], {"points": points.numpy()})
