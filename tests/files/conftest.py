@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from mops_lightning.data.formats.registry import WRITERS
-from mops_lightning.data.formats.table import Table
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.zoo import weights
+from tests.support.cloud_files import write_cloud
 from tests.support.dask import environment_kept
 
 
@@ -18,28 +17,37 @@ from tests.support.dask import environment_kept
 def folder(tmp_path_factory):
     """Two clouds far from the origin, one with a hole in its numbers, and trained weights."""
     folder = tmp_path_factory.mktemp("clouds")
+    clouds = folder / "in"
     random = np.random.default_rng(0)
-    (folder / "in" / "deep").mkdir(parents=True)
+    (clouds / "deep").mkdir(parents=True)
     for name, number in (("a.ply", 300), ("deep/b.npz", 200)):
-        points = random.normal(size=(number, 3)) * [5, 1, 1] + [1000, 0, 0]
+        unit = random.normal(size=(number, 3))
+        points = unit * [5, 1, 1] + [1000, 0, 0]
         points[7] = np.nan
-        table = Table(points, {"label": np.arange(number)})
-        WRITERS[f".{name.split('.')[1]}"](folder / "in" / name, table)
+        label = np.arange(number)
+        write_cloud(clouds / name, points, {"label": label})
     torch.manual_seed(0)
-    node = {"_target_": "mops_lightning.samplers.fmops.FMOPSNet", "m_max": 40}
-    config = {"learn": "sampler", "sampler": node}
-    weights.save(folder / "weights.safetensors", FMOPSNet(40), config, {})
-    weights.save(folder / "task.pt", FMOPSNet(40), {**config, "learn": "task"}, {})
+    sampler = FMOPSNet(40)
+    other = FMOPSNet(40)
+    weights.save(folder / "weights.safetensors", sampler, config_of({"m_max": 40}), {})
+    of_task_net = {**config_of({"m_max": 40}), "learn": "task"}
+    weights.save(folder / "task.pt", other, of_task_net, {})
     return folder
+
+
+def config_of(arguments):
+    """Return the configuration of a run that trained an FMOPS-Net."""
+    node = {"_target_": "mops_lightning.samplers.fmops.FMOPSNet", **arguments}
+    return {"learn": "sampler", "sampler": node}
 
 
 @pytest.fixture(scope="module")
 def anchored(tmp_path_factory):
     """The folder of a sampler whose anchors are farthest points."""
     folder = tmp_path_factory.mktemp("anchored")
-    node = {"_target_": "mops_lightning.samplers.fmops.FMOPSNet", "m_max": 40, "anchors": "fps"}
-    config = {"learn": "sampler", "sampler": node}
-    weights.save(folder / "weights.safetensors", FMOPSNet(40, anchors="fps"), config, {})
+    sampler = FMOPSNet(40, anchors="fps")
+    config = config_of({"m_max": 40, "anchors": "fps"})
+    weights.save(folder / "weights.safetensors", sampler, config, {})
     return folder
 
 
@@ -48,12 +56,12 @@ def local(tmp_path_factory):
     """The folder of a sampler with local columns, whose weights are moved away from their start."""
     folder = tmp_path_factory.mktemp("local")
     settings: dict[str, Any] = {"anchors": "fps", "candidates": 3, "neighbours": 6}
-    node = {"_target_": "mops_lightning.samplers.fmops.FMOPSNet", "m_max": 40, **settings}
     torch.manual_seed(0)
     sampler = FMOPSNet(40, **settings)
     for weight in sampler.queries.parameters():
         torch.nn.init.normal_(weight, std=0.3)
-    weights.save(folder / "weights.safetensors", sampler, {"learn": "sampler", "sampler": node}, {})
+    config = config_of({"m_max": 40, **settings})
+    weights.save(folder / "weights.safetensors", sampler, config, {})
     return folder
 
 

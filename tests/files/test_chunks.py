@@ -7,14 +7,15 @@ from numpy.testing import assert_allclose, assert_array_equal
 from mops_lightning.files import chunks
 from tests.support.cloud_files import contents, write_cloud
 from tests.support.clouds import normal_points
-from tests.support.downsample import call, done, refused
+from tests.support.downsample import done, refused
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".npy", ".bin", ".laz"])
 @pytest.mark.parametrize("readout", ["generated", "matched"])
 def test_chunks_equal_whole_file(suffix, readout, folder, tmp_path):
     source = tmp_path / f"in{suffix}"
-    points = normal_points(500, 1).astype(np.float32).astype(float)
+    in_float32 = normal_points(500, 1).astype(np.float32)
+    points = in_float32.astype(float)
     points[200:] = np.tile(points[:100], (3, 1))  # of equal points, the first one is matched
     number = "40 of 500 points"
     if suffix != ".laz":  # it holds whole numbers, NaN is none
@@ -22,14 +23,16 @@ def test_chunks_equal_whole_file(suffix, readout, folder, tmp_path):
         number = "40 of 440 points (60 more"
     intensity = np.arange(500, dtype=np.uint16)
     write_cloud(source, points, {"intensity": intensity})
+    in_whole = tmp_path / "whole.npz"
+    in_parts = tmp_path / "parts.npz"
     settings = ["--weights", folder, "--readout", readout]
 
-    done(source, tmp_path / "whole.npz", *settings)
-    out = done(source, tmp_path / "parts.npz", *settings, "--chunk", 60)
+    done(source, in_whole, *settings)
+    out = done(source, in_parts, *settings, "--chunk", 60)
 
     assert number in out
-    whole = contents(tmp_path / "whole.npz")
-    parts = contents(tmp_path / "parts.npz")
+    whole = contents(in_whole)
+    parts = contents(in_parts)
     assert_allclose(parts.points, whole.points, atol=1e-5)
     assert list(parts.columns) == list(whole.columns)
     for name, column in whole.columns.items():
@@ -60,40 +63,49 @@ def test_other_methods_sample_random_points_of_all_parts(settings, folder, tmp_p
     monkeypatch.setattr(chunks, "PART", 120)
     points = normal_points(500, 1)
     points[100:160] = np.nan
-    finite = np.delete(np.arange(500), slice(100, 160))
+    row = np.arange(500)
+    finite = np.delete(row, slice(100, 160))
     drawn = drawn_by_parts(finite, 200, seed=3)
-    numbered = np.column_stack([points, np.arange(500)])
-    np.save(tmp_path / "all.npy", numbered)
-    np.save(tmp_path / "drawn.npy", numbered[drawn])
+    numbered = np.column_stack([points, row])
+    in_all = tmp_path / "all.npy"
+    in_drawn = tmp_path / "drawn.npy"
+    of_all = tmp_path / "out.npy"
+    of_drawn = tmp_path / "expected.npy"
+    np.save(in_all, numbered)
+    np.save(in_drawn, numbered[drawn])
     settings = [folder if value == "FOLDER" else value for value in settings]
     settings += ["--m", 30, "--seed", 3]
-    done(tmp_path / "drawn.npy", tmp_path / "expected.npy", *settings)
 
-    status, out, _ = call(tmp_path / "all.npy", tmp_path / "out.npy", *settings, "--chunk", 200)
+    done(in_drawn, of_drawn, *settings)
+    out = done(in_all, of_all, *settings, "--chunk", 200)
 
-    assert status == 0
     assert "30 of 440 points (60 more without" in out
-    kept = np.load(tmp_path / "out.npy")
-    expected = np.load(tmp_path / "expected.npy")
+    kept = np.load(of_all)
+    expected = np.load(of_drawn)
     assert_array_equal(kept, expected)
 
 
 @pytest.mark.parametrize("chunk", [[], ["--chunk", 60]])
 def test_bounds_hold_for_chunks_and_whole_files(chunk, folder, tmp_path):
     points = normal_points(500, 1)
-    is_inside = (np.abs(points[:, :2]) <= 1).all(1)
-    np.save(tmp_path / "all.npy", points)
-    np.save(tmp_path / "part.npy", points[is_inside])
+    distances = np.abs(points[:, :2])
+    is_inside = distances.max(1) <= 1
+    in_all = tmp_path / "all.npy"
+    in_part = tmp_path / "part.npy"
+    of_all = tmp_path / "out.npy"
+    of_part = tmp_path / "expected.npy"
+    np.save(in_all, points)
+    np.save(in_part, points[is_inside])
     settings = ["--weights", folder, "--readout", "matched", "--m", 30]
     bounds = ["--bounds", "-1,-1,1,1"]
-    done(tmp_path / "part.npy", tmp_path / "expected.npy", *settings)
 
-    status, out, _ = call(tmp_path / "all.npy", tmp_path / "out.npy", *settings, *bounds, *chunk)
+    done(in_part, of_part, *settings)
+    out = done(in_all, of_all, *settings, *bounds, *chunk)
 
-    assert status == 0
-    assert f"30 of {is_inside.sum()} points, " in out
-    kept = np.load(tmp_path / "out.npy")
-    expected = np.load(tmp_path / "expected.npy")
+    number = is_inside.sum()
+    assert f"30 of {number} points, " in out
+    kept = np.load(of_all)
+    expected = np.load(of_part)
     assert_array_equal(kept, expected)
 
 
@@ -109,9 +121,13 @@ def test_bounds_hold_for_chunks_and_whole_files(chunk, folder, tmp_path):
     ],
 )
 def test_unsupported_file_says_why(name, content, said, folder, tmp_path):
-    (tmp_path / name).write_bytes(content)
+    source = tmp_path / name
+    source.write_bytes(content)
     settings = ["--weights", folder, "--readout", "matched", "--chunk", 60]
-    assert said in refused(tmp_path / name, tmp_path / "out.ply", *settings)
+
+    line = refused(source, tmp_path / "out.ply", *settings)
+
+    assert said in line
 
 
 def test_sampler_with_anchors_takes_whole_files_only(anchored, tmp_path):
@@ -120,8 +136,11 @@ def test_sampler_with_anchors_takes_whole_files_only(anchored, tmp_path):
     np.save(source, points)
     settings = ["--weights", anchored, "--readout", "matched", "--m", 20]
 
-    done(source, tmp_path / "out.npy", *settings)
+    out = tmp_path / "out.npy"
+
+    done(source, out, *settings)
     words = refused(source, tmp_path / "none.npy", *settings, "--chunk", 60)
 
-    assert np.load(tmp_path / "out.npy").shape == (20, 3)
+    kept = np.load(out)
+    assert kept.shape == (20, 3)
     assert "anchors=fps" in words

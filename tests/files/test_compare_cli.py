@@ -4,8 +4,6 @@ import re
 import numpy as np
 import pytest
 
-from mops_lightning.data.formats.registry import WRITERS
-from mops_lightning.data.formats.table import Table
 from mops_lightning.files.cli import compare as main
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.zoo import weights
@@ -22,14 +20,15 @@ def call(*arguments):
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scans")
-    random = np.random.default_rng(0)
-    for name in ("one.ply", "two.pcd"):
-        points = random.normal(size=(700, 3)) * [5, 3, 1] + [400_000, 0, 0]
-        WRITERS[f".{name[-3:]}"](folder / name, Table(points, {"intensity": points[:, 0] / 3}))
+    for seed, name in enumerate(("one.ply", "two.pcd")):
+        unit = normal_points(700, seed)
+        points = unit * [5, 3, 1] + [400_000, 0, 0]
+        intensity = points[:, 0] / 3
+        write_cloud(folder / name, points, {"intensity": intensity})
+    sampler = FMOPSNet(32)
     node = {"_target_": "mops_lightning.samplers.fmops.FMOPSNet", "m_max": 32}
-    weights.save(
-        folder / "weights.safetensors", FMOPSNet(32), {"learn": "sampler", "sampler": node}, {}
-    )
+    config = {"learn": "sampler", "sampler": node}
+    weights.save(folder / "weights.safetensors", sampler, config, {})
     return folder
 
 
@@ -43,7 +42,9 @@ def test_compare_writes_table_and_page(folder, tmp_path):
     assert "two.pcd: 90 of 700 points" in out
     with (tmp_path / "table.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == 2 * 2 * (len(UNTRAINED) + 1)
+    files_and_sizes = 2 * 2
+    methods = len(UNTRAINED) + 1
+    assert len(rows) == files_and_sizes * methods
     largest = {}
     for row in rows:
         largest[row["method"]] = float(row["hausdorff"])
@@ -94,11 +95,16 @@ def test_compare_keeps_an_earlier_comparison(folder, tmp_path):
 
 
 def test_compare_page_opens_without_errors(folder, tmp_path, opened):
+    path = tmp_path / "compare.html"
     call(folder / "one.ply", "--m", 30, "--methods", "random", "--out", tmp_path)
-    page, errors, requests = opened((tmp_path / "compare.html").as_uri())
+
+    page, errors, requests = opened(path.as_uri())
+
     page.wait_for_selector("#view .legend")
-    assert page.locator("#view .legendtext").all_text_contents() == ["input", "random"]
-    assert (errors, len(requests)) == ([], 1)
+    legend = page.locator("#view .legendtext")
+    assert legend.all_text_contents() == ["input", "random"]
+    assert errors == []
+    assert len(requests) == 1
 
 
 @pytest.mark.parametrize(
@@ -116,7 +122,10 @@ def test_compare_page_opens_without_errors(folder, tmp_path, opened):
 )
 def test_compare_mistake_ends_in_one_line(arguments, said, folder):
     arguments = [str(argument).replace("FOLDER", str(folder)) for argument in arguments]
-    assert re.search(said, refused(main, [folder / "one.ply", *arguments]))
+
+    line = refused(main, [folder / "one.ply", *arguments])
+
+    assert re.search(said, line)
 
 
 def test_compare_overwrites_an_earlier_comparison_on_request(folder, tmp_path):
@@ -127,4 +136,5 @@ def test_compare_overwrites_an_earlier_comparison_on_request(folder, tmp_path):
 
     done(main, [*arguments, "--seed", 1, "--overwrite"])
 
-    assert distances_of_first_row(table.read_text()) != distances_of_first_row(earlier)
+    later = table.read_text()
+    assert distances_of_first_row(later) != distances_of_first_row(earlier)

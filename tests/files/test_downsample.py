@@ -5,7 +5,8 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from tests.support.cloud_files import contents
-from tests.support.downsample import call, done, refused
+from tests.support.clouds import uniform_points
+from tests.support.downsample import done, refused
 
 
 @pytest.mark.parametrize(
@@ -25,45 +26,66 @@ from tests.support.downsample import call, done, refused
     ],
 )
 def test_untrained_method_keeps_rows_of_the_file(method, folder, tmp_path):
-    source, target = folder / "in" / "a.ply", tmp_path / "out.npz"
+    source = folder / "in" / "a.ply"
+    target = tmp_path / "out.npz"
+
     out = done(source, target, "--method", *method, "--m", 20)
+
     assert "20 of 299 points (1 more without finite coordinates left out)" in out
-    kept, whole = contents(target), contents(source)
+    kept = contents(target)
+    whole = contents(source)
     rows = kept.columns["label"].astype(int)
     assert len(set(rows)) == 20
     assert_array_equal(kept.points, whole.points[rows])
 
 
+def as_set(points):
+    return {tuple(point) for point in points}
+
+
 def test_matched_and_completed_readouts_keep_rows(folder, tmp_path):
     source = folder / "in" / "a.ply"
-    whole = contents(source).points
-    found = {}
-    for readout in ("generated", "matched", "completed"):
+    whole = contents(source).finite().points
+
+    def sampled(readout):
         target = tmp_path / f"{readout}.npy"
         settings = ["--weights", folder, "--readout", readout, "--m", 30]
-        assert call(source, target, *settings, "--coordinates-only")[0] == 0
-        found[readout] = np.load(target)
-        assert found[readout].shape == (30, 3)
-    inside = {readout: {tuple(p) for p in points} for readout, points in found.items()}
-    all_points = {tuple(p) for p in whole}
-    assert not inside["generated"] & all_points
-    assert inside["matched"] < inside["completed"] <= all_points
-    assert len(inside["completed"]) == 30
+        done(source, target, *settings, "--coordinates-only")
+        points = np.load(target)
+        assert points.shape == (30, 3)
+        return points
+
+    generated = sampled("generated")
+    matched = as_set(sampled("matched"))
+    completed = as_set(sampled("completed"))
+
+    all_points = as_set(whole)
+    assert not as_set(generated) & all_points
+    assert matched < completed <= all_points
+    assert len(completed) == 30
     # Mapped back: among the points, not in the unit sphere.
-    finite = whole[np.isfinite(whole).all(1)]
-    assert (found["generated"] > finite.min(0)).all()
-    assert (found["generated"] < finite.max(0)).all()
+    assert (generated > whole.min(0)).all()
+    assert (generated < whole.max(0)).all()
 
 
 @pytest.mark.parametrize("size", [1e200, 1e307])
 def test_huge_coordinates_are_rejected(size, folder, tmp_path):
-    np.save(tmp_path / "a.npy", np.random.default_rng(0).uniform(1, 9, size=(90, 3)) * size)
-    learned = ["--weights", folder, "--readout", "matched", "--chunk", 60]
-    for settings in (["--method", "fps", "--m", 4], learned):
-        assert "too large" in refused(tmp_path / "a.npy", tmp_path / "b.npy", *settings)
+    source = tmp_path / "a.npy"
+    out = tmp_path / "b.npy"
+    points = 1 + 8 * uniform_points(90, 0)
+    np.save(source, points * size)
+
+    whole = refused(source, out, "--method", "fps", "--m", 4)
+    by_chunks = refused(source, out, "--weights", folder, "--readout", "matched", "--chunk", 60)
+
+    assert "too large" in whole
+    assert "too large" in by_chunks
 
 
 def test_tile_trained_sampler_of_many_sizes(folder, tmp_path):
-    options = ["--weights", folder, "--tile", 64, "--m", 120]
-    assert call(folder / "in" / "a.ply", tmp_path / "a.npy", *options)[0] == 0
-    assert len(np.unique(np.load(tmp_path / "a.npy"), axis=0)) == 120
+    out = tmp_path / "a.npy"
+
+    done(folder / "in" / "a.ply", out, "--weights", folder, "--tile", 64, "--m", 120)
+
+    different = np.unique(np.load(out), axis=0)
+    assert len(different) == 120

@@ -4,7 +4,7 @@ import pytest
 
 from mops_lightning.filesystem import TEMPORARY
 from tests.support.cloud_files import contents
-from tests.support.downsample import call, done, refused
+from tests.support.downsample import done, refused
 
 FPS = ["--m", 5, "--method", "fps"]
 GENERATED = ["--weights", "weights.safetensors", "--readout", "generated"]
@@ -46,17 +46,25 @@ GENERATED = ["--weights", "weights.safetensors", "--readout", "generated"]
 )
 def test_mistake_ends_in_one_line(arguments, said, folder, tmp_path, monkeypatch):
     monkeypatch.chdir(folder)
-    assert said in refused("in/a.ply", tmp_path / "out.ply", *arguments)
-    assert not (tmp_path / "out.ply").exists()
+    out = tmp_path / "out.ply"
+
+    line = refused("in/a.ply", out, *arguments)
+
+    assert said in line
+    assert not out.exists()
 
 
 def test_existing_output_needs_overwrite(folder, tmp_path):
-    source, target = folder / "in" / "a.ply", tmp_path / "out.ply"
+    source = folder / "in" / "a.ply"
+    target = tmp_path / "out.ply"
     target.write_text("mine")
     settings = ["--method", "random", "--m", 5]
-    assert f"{target} exists" in refused(source, target, *settings)
+
+    line = refused(source, target, *settings)
+
+    assert f"{target} exists" in line
     assert target.read_text() == "mine"
-    assert call(source, target, *settings, "--overwrite")[0] == 0
+    done(source, target, *settings, "--overwrite")
     assert len(contents(target).points) == 5
 
 
@@ -64,18 +72,24 @@ def test_folder_removes_what_a_killed_run_left(folder, tmp_path):
     left = tmp_path / "out" / "below" / f"{TEMPORARY}cloud-x.ply"
     left.parent.mkdir(parents=True)
     left.write_bytes(b"half")
-    assert call(folder / "in", tmp_path / "out", "--m", 5, "--method", "fps")[0] == 0
+
+    done(folder / "in", tmp_path / "out", "--m", 5, "--method", "fps")
+
     assert not left.exists()
 
 
 def test_real_scans_keep_attributes(real_data, tmp_path):
     scans = real_data("scans")
+
     done(scans, tmp_path, "--method", "random", "--m", 100)
+
     fragment = contents(tmp_path / "fragment.pcd")
+    bunny = contents(tmp_path / "stanford-bunny.ply")  # .obj has no room
+    sweep = contents(tmp_path / "kitti_000000.bin")
     assert len(fragment.points) == 100
     assert "normal_x" in fragment.columns
-    assert "nx" in contents(tmp_path / "stanford-bunny.ply").columns  # .obj has no room
-    assert len(contents(tmp_path / "kitti_000000.bin").columns["intensity"]) == 100
+    assert "nx" in bunny.columns
+    assert len(sweep.columns["intensity"]) == 100
 
 
 def test_downsample_of_one_point_says_point(tmp_path):

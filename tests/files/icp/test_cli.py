@@ -16,15 +16,13 @@ def room(number, seed):
     rng = np.random.default_rng(seed)
     u, v = rng.uniform(0, 4, (2, number))
     zero = np.zeros(number)
-    faces = np.stack(
-        [
-            np.stack([u, v, zero], 1),
-            np.stack([u, zero, v], 1),
-            np.stack([zero, u, v], 1),
-            np.stack([u / 4 + 1, v / 4 + 2, zero + 0.5], 1),
-        ]
-    )
-    return faces[rng.integers(4, size=number), np.arange(number)]
+    floor = np.stack([u, v, zero], 1)
+    left_wall = np.stack([u, zero, v], 1)
+    right_wall = np.stack([zero, u, v], 1)
+    step = np.stack([u / 4 + 1, v / 4 + 2, zero + 0.5], 1)
+    faces = np.stack([floor, left_wall, right_wall, step])
+    face_of_point = rng.integers(4, size=number)
+    return faces[face_of_point, np.arange(number)]
 
 
 @pytest.fixture
@@ -32,12 +30,14 @@ def scans(tmp_path):
     folder = tmp_path / "scans"
     folder.mkdir()
     for number in range(2):
-        write_cloud(folder / f"{number}.ply", room(1500, number))
+        points = room(1500, number)
+        write_cloud(folder / f"{number}.ply", points)
     return folder
 
 
 def called(*arguments):
-    compare([str(argument) for argument in arguments])
+    words = [str(argument) for argument in arguments]
+    compare(words)
 
 
 def refused(capsys, *arguments):
@@ -52,6 +52,15 @@ def rows_of(folder):
         return list(csv.DictReader(file))
 
 
+def numbers_of(rows, column, method=None):
+    """Return the numbers of a column, in all rows or in those of a method."""
+    numbers = []
+    for row in rows:
+        if method in (None, row["method"]):
+            numbers.append(float(row[column]))
+    return numbers
+
+
 def test_crops_give_a_row_for_every_method_size_registration_and_draw(scans, tmp_path, capsys):
     out = tmp_path / "out"
 
@@ -62,10 +71,11 @@ def test_crops_give_a_row_for_every_method_size_registration_and_draw(scans, tmp
     rows = rows_of(out)
     assert len(rows) == 2 * 2 * (1 + 2 * 4)
     assert {row["pairs"] for row in rows} == {"4"}
-    whole = [float(row["degrees"]) for row in rows if row["method"] == "all points"]
-    assert max(whole) < 5
-    voxels = [float(row["points"]) for row in rows if row["method"] == "small_gicp_voxel"]
-    assert all(10 <= number <= 40 for number in voxels)
+    degrees = numbers_of(rows, "degrees", "all points")
+    assert max(degrees) < 5
+    voxels = numbers_of(rows, "points", "small_gicp_voxel")
+    assert min(voxels) >= 10
+    assert max(voxels) <= 40
     printed = capsys.readouterr().out
     assert "plane, 16 points: 2 draws of 4 alignments" in printed
     assert "against fps_farthest" in printed
@@ -85,22 +95,29 @@ def test_two_runs_of_one_seed_find_the_same_errors(scans, tmp_path):
 
 
 def test_frames_with_poses_are_aligned_to_the_true_motion(tmp_path, capsys):
-    folder, out = tmp_path / "frames", tmp_path / "out"
-    folder.mkdir()
-    for number in range(3):
-        write_cloud(folder / f"{number}.ply", room(3000, number) - [0.2 * number, 0, 0])
+    folder = tmp_path / "frames"
+    out = tmp_path / "out"
     poses = tmp_path / "poses.txt"
-    poses.write_text("".join(f"1 0 0 {0.2 * i} 0 1 0 0 0 0 1 0\n" for i in range(3)))
+    folder.mkdir()
+    lines = []
+    for number in range(3):
+        way = 0.2 * number
+        points = room(3000, number) - [way, 0, 0]
+        write_cloud(folder / f"{number}.ply", points)
+        lines.append(f"1 0 0 {way} 0 1 0 0 0 0 1 0\n")
+    poses.write_text("".join(lines))
 
     called("--task", "icp", folder, "--poses", poses, "--m", 300, "--draws", 2, "--methods",
            "covariance", "--registration", "plane", "--shift", 0.1, "--out", out)  # fmt: skip
 
     rows = rows_of(out)
     assert [row["method"] for row in rows] == ["all points", "covariance"] * 2
-    assert max(float(row["degrees"]) for row in rows) < 0.5
-    assert max(float(row["shift"]) for row in rows) < 0.05
-    starts = {row["degrees"] for row in rows if row["method"] == "all points"}
-    assert len(starts) == 2  # of every draw its own: frames are the same
+    degrees = numbers_of(rows, "degrees")
+    shifts = numbers_of(rows, "shift")
+    assert max(degrees) < 0.5
+    assert max(shifts) < 0.05
+    starts = numbers_of(rows, "degrees", "all points")
+    assert len(set(starts)) == 2  # of every draw its own: frames are the same
     assert "plane, 300 points: 2 draws of 2 alignments" in capsys.readouterr().out
 
 
@@ -109,17 +126,20 @@ def test_trained_sampler_is_compared_by_its_completed_sets(scans, tmp_path):
            "--methods", "random", "--weights", "fmops.modelnet40-m512",
            "--out", tmp_path / "out")  # fmt: skip
 
-    rows = [row for row in rows_of(tmp_path / "out") if row["method"] == "trained"]
-    assert [row["registration"] for row in rows] == ["plane", "gicp"]
-    assert {row["points"] for row in rows} == {"20.0"}
+    rows = rows_of(tmp_path / "out")
+    trained = [row for row in rows if row["method"] == "trained"]
+    assert [row["registration"] for row in trained] == ["plane", "gicp"]
+    assert [row["points"] for row in trained] == ["20.0", "20.0"]
 
 
 def test_target_is_sampled_where_that_is_asked_for(scans, tmp_path):
     degrees = []
     for number, words in enumerate(([], ["--sample-target"])):
+        out = tmp_path / str(number)
         called("--task", "icp", scans, "--m", 100, "--draws", 1, "--crops", 2, "--points", 600,
-               "--methods", "random", "--out", tmp_path / str(number), *words)  # fmt: skip
-        degrees.append([float(row["degrees"]) for row in rows_of(tmp_path / str(number))])
+               "--methods", "random", "--out", out, *words)  # fmt: skip
+        rows = rows_of(out)
+        degrees.append(numbers_of(rows, "degrees"))
 
     whole, sampled = degrees
     assert whole[:2] == sampled[:2]  # plane and gicp from all points
@@ -144,13 +164,17 @@ def test_target_is_sampled_where_that_is_asked_for(scans, tmp_path):
     ],
 )
 def test_mistakes_end_in_one_line(scans, tmp_path, capsys, arguments, message):
-    error = refused(capsys, "--task", "icp", scans, *arguments, "--out", tmp_path / "out")
+    out = tmp_path / "out"
+
+    error = refused(capsys, "--task", "icp", scans, *arguments, "--out", out)
 
     assert re.search(message, error), error
 
 
 def test_options_of_icp_are_refused_without_it(scans, tmp_path, capsys):
-    error = refused(capsys, scans / "0.ply", "--m", 20, "--draws", 3, "--out", tmp_path / "out")
+    settings = ["--m", 20, "--draws", 3, "--out", tmp_path / "out"]
+
+    error = refused(capsys, scans / "0.ply", *settings)
 
     assert "--draws is for --task icp" in error
 
@@ -165,14 +189,18 @@ def test_one_folder_is_needed(scans, tmp_path, capsys):
 
 
 def test_wrong_folder_is_reported_before_a_sampler_is_loaded(scans, tmp_path, capsys):
-    wrong = ["--task", "icp", tmp_path / "none", "--m", 20, "--weights", "no.such.model"]
+    settings = ["--m", 20, "--weights", "no.such.model"]
 
-    assert "takes one folder of scans, got" in refused(capsys, *wrong)
+    error = refused(capsys, "--task", "icp", tmp_path / "none", *settings)
+
+    assert "takes one folder of scans, got" in error
 
 
 def test_missing_library_is_named(scans, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "small_gicp", None)
 
-    error = refused(capsys, "--task", "icp", scans, "--m", 20, "--out", tmp_path / "out")
+    settings = ["--m", 20, "--out", tmp_path / "out"]
+
+    error = refused(capsys, "--task", "icp", scans, *settings)
 
     assert "pip install 'mops-lightning[icp]'" in error

@@ -1,6 +1,7 @@
 """The clouds on which a task net is scored."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,12 +25,15 @@ def files(tmp_path):
         points = random.random((90, 3))
         points[:, 0] += 500_000
         is_left = points[:, 1] < 0.5
-        columns = {
-            "intensity": np.where(is_left, 150.0, 75.0).astype(np.float32),
-            "part": np.where(is_left, 2, 5).astype(np.int32),
+        intensity = np.where(is_left, 150.0, 75.0)
+        part = np.where(is_left, 2, 5)
+        columns: dict[str, Any] = {
+            "intensity": intensity.astype(np.float32),
+            "part": part.astype(np.int32),
         }
-        paths.append(tmp_path / f"{number}.ply")
-        write_cloud(paths[-1], points, columns)
+        path = tmp_path / f"{number}.ply"
+        paths.append(path)
+        write_cloud(path, points, columns)
     return paths
 
 
@@ -38,11 +42,9 @@ def subject(**changes):
     return replace(of_module, **changes)
 
 
-def drawn(sources, chosen, seed=0):
-    return {
-        half: [batch for batch, _ in batches(sources, chosen, half, seed)]
-        for half in (CHOOSING, CHECKING)
-    }
+def drawn(sources, chosen, half, seed=0):
+    """Return the batches of a half of the files."""
+    return [batch for batch, _ in batches(sources, chosen, half, seed)]
 
 
 def test_batches_have_channels_and_parts_of_the_same_points(files):
@@ -51,21 +53,28 @@ def test_batches_have_channels_and_parts_of_the_same_points(files):
 
     sources = read_sources(files, chosen, 0, None)
 
-    by_half = drawn(sources, chosen)
-    clouds = [batch for half in by_half.values() for batch in half]
-    assert [len(batch.points) for batch in clouds] == [4, 2]  # two crops of two files, and of one
-    for batch in clouds:
+    (of_two_files,) = drawn(sources, chosen, CHOOSING)
+    (of_one_file,) = drawn(sources, chosen, CHECKING)
+    assert len(of_two_files.points) == 4  # two crops each
+    assert len(of_one_file.points) == 2
+    right = (75 - 100) / 25
+    left = (150 - 100) / 25
+    for batch in (of_two_files, of_one_file):
         scaled = batch.points[..., 3]
-        assert set(scaled.unique().tolist()) == {-1.0, 2.0}  # (75 - 100) / 25, (150 - 100) / 25
-        assert torch.equal(batch.parts, torch.where(scaled == 2.0, 1, 0))
+        parts = (scaled == left).long()
+        assert scaled.unique().tolist() == [right, left]
+        assert torch.equal(batch.parts, parts)
         lengths = batch.points[..., :3].norm(dim=2).amax(1)
         assert torch.allclose(lengths, torch.ones(len(lengths)))
 
 
 def test_batches_of_another_seed_are_other_clouds(files):
-    sources = read_sources(files, subject(), 0, None)
+    chosen = subject()
+    sources = read_sources(files, chosen, 0, None)
 
-    first, same, other = (drawn(sources, subject(), seed)[CHECKING][0] for seed in (0, 0, 1))
+    (first,) = drawn(sources, chosen, CHECKING, seed=0)
+    (same,) = drawn(sources, chosen, CHECKING, seed=0)
+    (other,) = drawn(sources, chosen, CHECKING, seed=1)
 
     assert torch.equal(first.points, same.points)
     assert not torch.equal(first.points, other.points)
@@ -73,15 +82,17 @@ def test_batches_of_another_seed_are_other_clouds(files):
 
 def test_parts_with_names_are_numbered_from_zero(files):
     names = tuple("abcdef")
+    chosen = subject(label="part", outputs=names)
 
-    sources = read_sources(files, subject(label="part", outputs=names), 0, None)
+    first, *_ = read_sources(files, chosen, 0, None)
 
-    assert sources[0].parts is not None
-    assert set(sources[0].parts.tolist()) == {2, 5}
+    assert first.parts is not None
+    assert set(first.parts.tolist()) == {2, 5}
 
 
 def test_file_without_the_channel_is_refused(files):
-    chosen = subject(channels=PointChannels([Channel("reflectance", 0.0, 1.0)]))
+    channels = PointChannels([Channel("reflectance", 0.0, 1.0)])
+    chosen = subject(channels=channels)
 
     with pytest.raises(UserError, match=r"--task-net: .*0\.ply has no column 'reflectance'"):
         read_sources(files, chosen, 0, None)
@@ -89,13 +100,16 @@ def test_file_without_the_channel_is_refused(files):
 
 def test_halves_share_the_files_of_every_class(tmp_path):
     for name in ("a", "b"):
-        (tmp_path / name).mkdir()
+        folder = tmp_path / name
+        folder.mkdir()
         for number in range(4):
-            np.save(tmp_path / name / f"{number}.npy", uniform_points(70, number))
+            points = uniform_points(70, number)
+            np.save(folder / f"{number}.npy", points)
     files = sorted(tmp_path.rglob("*.npy"))
 
     sources = read_sources(files, subject(), 0, None)
 
     for label in (0, 1):
         halves = [source.half for source in sources if source.label == label]
-        assert halves.count(CHOOSING) == halves.count(CHECKING) == 2
+        assert halves.count(CHOOSING) == 2
+        assert halves.count(CHECKING) == 2
