@@ -21,8 +21,8 @@ from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.zoo import weights
 
-KINDS = ((4, 32), (4, 16), (2, 16))
-"""Candidates per point and entries of a column."""
+KINDS = ((4, 64), (4, 16), (2, 16))
+"""Candidates per point and entries of a column; the first pair is the tested one."""
 
 FILE_POINTS = 8_000_000
 FILE_M = 10_000
@@ -77,7 +77,7 @@ def _of_file(rounds: int) -> list[Row]:
     with TemporaryDirectory() as name:
         folder = Path(name)
         _write_terrain(folder / "terrain.ply")
-        candidates, neighbours = KINDS[-1]
+        candidates, neighbours = KINDS[0]
         settings = ["sampler=mops", "sampler.anchors=fps", f"m={FILE_M}"]
         settings += [f"sampler.candidates={candidates}", f"sampler.neighbours={neighbours}"]
         net = MOPSNet(FILE_M, anchors="fps", candidates=candidates, neighbours=neighbours)
