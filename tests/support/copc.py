@@ -28,8 +28,10 @@ def write_copc(
         depth: deepest level, which takes all points that are left.
         each: points of every other cell.
     """
-    half = float(np.ptp(points, axis=0).max()) / 2 + 1e-3
-    centre = (points.min(0) + points.max(0)) / 2
+    low = points.min(0)
+    high = points.max(0)
+    half = float((high - low).max()) / 2 + 1e-3
+    centre = (low + high) / 2
     header = laspy.LasHeader(point_format=6, version="1.4")
     header.offsets = centre
     header.scales = [1e-3] * 3
@@ -38,15 +40,17 @@ def write_copc(
     record.intensity = np.arange(len(points)) % 2**16
     header.point_count = len(points)
     header.are_points_compressed = True
-    header.mins = points.min(0)
-    header.maxs = points.max(0)
+    header.mins = low
+    header.maxs = high
     laz = lazrs.LazVlr.new_for_compression(6, 0, True)
 
     def write_header(page: int, size: int) -> None:
         """Write the header; the place of the octree's page is known when all cells are written."""
         info = struct.pack("<5d2Q2d88x", *centre, half, spacing, page, size, 0, 0)
-        records = [laspy.VLR("copc", INFO, "", info)]
-        records += [laspy.VLR("laszip encoded", 22204, "", laz.record_data())]
+        records = [
+            laspy.VLR("copc", INFO, "", info),
+            laspy.VLR("laszip encoded", 22204, "", laz.record_data()),
+        ]
         header.vlrs = laspy.vlrs.vlrlist.VLRList(records)
         header.number_of_evlrs = int(page > 0)
         header.start_of_first_evlr = max(page - 60, 0)
@@ -57,8 +61,11 @@ def write_copc(
         write_header(0, 0)
         cells = _write_cells(stream, laz, record, points, centre - half, 2 * half, depth, each)
         end = stream.seek(0, 2)
-        page = b"".join(struct.pack("<4iQ2i", *cell) for cell in cells)
-        stream.write(struct.pack("<H16sHQ32s", 0, b"copc", HIERARCHY, len(page), b"") + page)
+        page = b""
+        for cell in cells:
+            page += struct.pack("<4iQ2i", *cell)
+        head = struct.pack("<H16sHQ32s", 0, b"copc", HIERARCHY, len(page), b"")
+        stream.write(head + page)
         write_header(end + 60, len(page))
 
 
@@ -69,15 +76,20 @@ def _write_cells(stream, laz, record, points, corner, side, depth, each):
     left = np.arange(len(points))
     entries = []
     for level in range(depth + 1):
-        keys = ((points[left] - corner) / side * 2**level).astype(int)
+        cells_of_side = 2**level
+        keys = ((points[left] - corner) / side * cells_of_side).astype(int)
         taken = []
         for key in np.unique(keys, axis=0):
-            rows = left[(keys == key).all(1)]
-            rows = rows if level == depth else rows[:each]
+            is_in_cell = (keys == key).all(1)
+            rows = left[is_in_cell]
+            if level < depth:
+                rows = rows[:each]
             start = stream.tell()
-            compressor.compress_many(np.frombuffer(record.array[rows].tobytes(), np.uint8))
+            chunk = record.array[rows].tobytes()
+            compressor.compress_many(np.frombuffer(chunk, np.uint8))
             compressor.finish_current_chunk()
-            entries.append((level, *key, start, stream.tell() - start, len(rows)))
+            size = stream.tell() - start
+            entries.append((level, *key, start, size, len(rows)))
             taken.append(rows)
         left = np.setdiff1d(left, np.concatenate(taken))
     compressor.done()

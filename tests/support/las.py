@@ -8,6 +8,7 @@ from uuid import UUID
 
 import laspy
 import numpy as np
+from numpy.typing import NDArray
 
 WAVEFORM_FORMATS = (4, 5, 9, 10)
 VERSIONS = dict.fromkeys(range(4), "1.2") | dict.fromkeys((4, 5), "1.3")
@@ -36,9 +37,12 @@ def full_cloud(form: int, number: int = 300) -> laspy.LasData:
     header.global_encoding.synthetic_return_numbers = True
     header.global_encoding.wkt = form >= 6
     header.global_encoding.waveform_data_packets_external = form in WAVEFORM_FORMATS
-    wkt = laspy.VLR("LASF_Projection", 2112, "WKT", b'LOCAL_CS["somewhere"]\0')
-    classes = laspy.VLR("LASF_Spec", 0, "classes", struct.pack("<B15s", 5, b"veg. > 2 m (?)"))
-    header.vlrs += [wkt, classes, laspy.VLR("somebody", 9, "notes", bytes(range(256)))]
+    vegetation = struct.pack("<B15s", 5, b"veg. > 2 m (?)")
+    header.vlrs += [
+        laspy.VLR("LASF_Projection", 2112, "WKT", b'LOCAL_CS["somewhere"]\0'),
+        laspy.VLR("LASF_Spec", 0, "classes", vegetation),
+        laspy.VLR("somebody", 9, "notes", bytes(range(256))),
+    ]
     header.add_extra_dims(EXTRA)
     cloud = laspy.LasData(header)
     random = np.random.default_rng(form)
@@ -56,31 +60,41 @@ def full_cloud(form: int, number: int = 300) -> laspy.LasData:
 
 def fill(cloud: laspy.LasData, dimension: Any, random: np.random.Generator) -> None:
     """Write random numbers into a dimension."""
-    numbers = cloud.points.array
-    shape = (len(numbers), dimension.num_elements)
-    if dimension.kind == laspy.DimensionKind.BitField:
-        cloud[dimension.name] = random.integers(0, 2**dimension.num_bits, len(numbers))
+    kinds = laspy.DimensionKind
+    columns = cloud.points.array
+    shape = (len(columns), dimension.num_elements)
+    if dimension.kind == kinds.BitField:
+        end = 2**dimension.num_bits
+        cloud[dimension.name] = random.integers(0, end, len(columns))
         return
-    if dimension.kind == laspy.DimensionKind.FloatingPoint:
-        numbers[dimension.name] = (random.normal(size=shape) * 1000).squeeze()
+    values: NDArray[Any]
+    if dimension.kind == kinds.FloatingPoint:
+        values = random.normal(size=shape) * 1000
+    elif dimension.kind == kinds.UnsignedInteger:
+        values = random.integers(1, 100, shape)
     else:
-        least = 1 if dimension.kind == laspy.DimensionKind.UnsignedInteger else -100
-        numbers[dimension.name] = random.integers(least, 100, shape).squeeze()
+        values = random.integers(-100, 100, shape)
+    columns[dimension.name] = values.squeeze()
 
 
 def header_fields(path: Path) -> dict[str, Any]:
     """Return what a copy of a file must have in common with it, from the bytes of its header."""
     content = path.read_bytes()
-    fields = {
+    fields: dict[str, Any] = {
         "source id and encoding": content[4:8],
         "identifier": content[8:24],
         "version": content[24:26],
         "system": content[26:58],
         "date": content[90:94],
         "scales and offsets": content[131:179],
-        "records": [r for r in records(content) if r[0] != b"laszip encoded".ljust(16, b"\0")],
+        "records": [],
     }
-    if content[25] >= 4:
+    for record in records(content):
+        user = record[0].rstrip(b"\0")
+        if user != b"laszip encoded":
+            fields["records"].append(record)
+    minor_version = content[25]
+    if minor_version >= 4:
         fields["extended"] = extended_records(content)
     return fields
 
@@ -90,26 +104,30 @@ def records(content: bytes) -> list[tuple]:
 
     The smallest and largest numbers of extra dimensions are left out: they are those of the points.
     """
-    (place,) = struct.unpack_from("<H", content, 94)
+    (start,) = struct.unpack_from("<H", content, 94)
     (number,) = struct.unpack_from("<I", content, 100)
-    found = []
+    written = []
     for _ in range(number):
-        user, identifier, length, text = struct.unpack_from("<2x16sHH32s", content, place)
-        data = bytearray(content[place + 54 : place + 54 + length])
-        if (user.rstrip(b"\0"), identifier) == (b"LASF_Spec", 4):
-            for start in range(0, length, 192):
-                data[start + 64 : start + 112] = bytes(48)
-        found.append((user, identifier, text, bytes(data)))
-        place += 54 + length
-    return found
+        user, identifier, length, text = struct.unpack_from("<2x16sHH32s", content, start)
+        end = start + 54 + length
+        data = bytearray(content[start + 54 : end])
+        describes_dimensions = user.rstrip(b"\0") == b"LASF_Spec" and identifier == 4
+        if describes_dimensions:
+            for description in range(0, length, 192):
+                data[description + 64 : description + 112] = bytes(48)
+        written.append((user, identifier, text, bytes(data)))
+        start = end
+    return written
 
 
 def extended_records(content: bytes) -> list[tuple]:
     """Return user, number, description and data of the records after the points."""
-    place, number = struct.unpack_from("<QI", content, 235)
-    found = []
+    start, number = struct.unpack_from("<QI", content, 235)
+    written = []
     for _ in range(number):
-        user, identifier, length, text = struct.unpack_from("<2x16sHQ32s", content, place)
-        found.append((user, identifier, text, content[place + 60 : place + 60 + length]))
-        place += 60 + length
-    return found
+        user, identifier, length, text = struct.unpack_from("<2x16sHQ32s", content, start)
+        end = start + 60 + length
+        data = content[start + 60 : end]
+        written.append((user, identifier, text, data))
+        start = end
+    return written

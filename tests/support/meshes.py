@@ -29,8 +29,16 @@ def quantised_glb(sparse=False):
     the first come from a sparse accessor.
     """
     largest = 32767
-    corners = np.array([[0, 0, 0, 0], [largest, 0, 0, 0], [0, largest, 0, 0]], "<i2")
-    buffer = corners.tobytes() + np.array([0, 1, 2, 0], "<u2").tobytes()
+    corners = np.array(
+        [
+            [0, 0, 0, 0],
+            [largest, 0, 0, 0],
+            [0, largest, 0, 0],
+        ],
+        "<i2",
+    )
+    triangle = np.array([0, 1, 2, 0], "<u2")
+    buffer = corners.tobytes() + triangle.tobytes()
     views = [
         {"buffer": 0, "byteOffset": 0, "byteLength": 24, "byteStride": 8},
         {"buffer": 0, "byteOffset": 24, "byteLength": 6},
@@ -44,7 +52,8 @@ def quantised_glb(sparse=False):
     if sparse:
         views.append({"buffer": 0, "byteOffset": len(buffer), "byteLength": 2})
         views.append({"buffer": 0, "byteOffset": len(buffer) + 4, "byteLength": 12})
-        buffer += np.array([1, 2, 0, 0], "u1").tobytes() + corners[1:, :3].tobytes()
+        rows = np.array([1, 2, 0, 0], "u1")
+        buffer += rows.tobytes() + corners[1:, :3].tobytes()
         places = {"bufferView": 2, "componentType": 5121}
         positions["sparse"] = {"count": 2, "indices": places, "values": {"bufferView": 3}}
     else:

@@ -15,49 +15,71 @@ def table(folder, *metrics, mixed=False):
 
 
 def put(folder, sampler, m, metrics, task="classification", net="pointnet", **changes):
-    names = {"task": task, "net": net, "dataset": "modelnet40", "sampler": sampler}
     config = {
         "m": m,
-        "names": names,
+        "names": {"task": task, "net": net, "dataset": "modelnet40", "sampler": sampler},
         "task": changes.pop("settings", {}),
         "sampler": changes.pop("of", {}),
         **changes.pop("config", {}),
     }
-    score = {"score_name": next(iter(metrics))}
-    changes = {"dataset_fingerprint": "d", "task_weights_sha256": "w", **score, **changes}
-    made = record(config=config, metrics=metrics, **changes)
-    return run_record.write(folder / f"{sampler}-{m}-{net}", made)
+    fields = {
+        "score_name": first_of(metrics),
+        "dataset_fingerprint": "d",
+        "task_weights_sha256": "w",
+        **changes,
+    }
+    written = record(config=config, metrics=metrics, **fields)
+    return run_record.write(folder / f"{sampler}-{m}-{net}", written)
+
+
+def first_of(metrics):
+    return next(iter(metrics))
 
 
 def edited(path, **changes):
     """Change fields of a written record."""
-    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+    fields = json.loads(path.read_text())
+    fields |= changes
+    path.write_text(json.dumps(fields))
 
 
 def rows(text):
     """The cells of all tables of a report, without marks of the best values."""
     plain = re.sub(r"\*\*|</?u>", "", text)
-    return [
-        [cell.strip() for cell in line.strip()[1:-1].split("|")]
-        for line in plain.splitlines()
-        if line.startswith("| ")
-    ]
+    cells_of_rows = []
+    for line in plain.splitlines():
+        if line.startswith("| "):
+            _, *cells, _ = line.strip().split("|")
+            cells_of_rows.append([cell.strip() for cell in cells])
+    return cells_of_rows
 
 
 def put_cell(folder, name, sampler, values, seed=0, cost=0.5, **settings):
     """A run of a sweep, whose settings beside the size are given dotted."""
-    names = {"task": "reconstruction", "net": "autoencoder", "dataset": "shapes"}
+    of_sampler = settings.pop("of", {})
     config = {
-        "names": {**names, "sampler": sampler},
+        "names": {
+            "task": "reconstruction",
+            "net": "autoencoder",
+            "dataset": "shapes",
+            "sampler": sampler,
+        },
         "task": {"exact_up_to": 2048},
-        "sampler": {"m": 32, **settings.pop("of", {})},
+        "sampler": {"m": 32, **of_sampler},
         **settings,
     }
-    metrics = {f"test/{readout}/nre_cd": value for readout, value in values.items()}
-    seconds = {"total": 1.0, "fit": cost}
-    score = {"score_name": "test/generated/nre_cd", "dataset_fingerprint": "d"}
-    content = record(config=config, metrics=metrics, seed=seed, seconds=seconds, **score)
-    return run_record.write(folder / name, content)
+    metrics = {}
+    for readout, value in values.items():
+        metrics[f"test/{readout}/nre_cd"] = value
+    written = record(
+        config=config,
+        metrics=metrics,
+        seed=seed,
+        seconds={"total": 1.0, "fit": cost},
+        score_name="test/generated/nre_cd",
+        dataset_fingerprint="d",
+    )
+    return run_record.write(folder / name, written)
 
 
 def put_planes(folder):
@@ -84,13 +106,19 @@ def put_pairs(folder, sampler, m, value, net="pcrnet", **changes):
 
 
 def put_net(folder, name, metrics, task, net="pcrnet", points=1024, **settings):
-    metrics = {f"test/full/{metric}": value for metric, value in metrics.items()}
+    of_full_clouds = {}
+    for metric, value in metrics.items():
+        of_full_clouds[f"test/full/{metric}"] = value
     config = {
         "learn": "task",
         "names": {"task": task, "net": net, "dataset": "modelnet40", "sampler": "mops"},
         "task": {"net": {"_target_": net, "n_points": points, **settings}},
         "dataset": {"n_points": points},
     }
-    size = {"task": 1_025_000}
-    made = record(config, metrics=metrics, parameters=size, score_name=next(iter(metrics)))
-    return run_record.write(folder / f"{name}-{points}", made)
+    written = record(
+        config,
+        metrics=of_full_clouds,
+        parameters={"task": 1_025_000},
+        score_name=first_of(of_full_clouds),
+    )
+    return run_record.write(folder / f"{name}-{points}", written)

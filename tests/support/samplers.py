@@ -24,8 +24,11 @@ from mops_lightning.samplers.snet import SNet
 from mops_lightning.samplers.steady import SteadySampler
 from mops_lightning.samplers.voxel import VoxelSampler
 
-SMALL: dict[str, Any] = {"feature_channels": (8, 6), "head_channels": (12, 10)}
-MOPS_LAYERS: dict[str, Any] = {"feature_channels": (8, 6), "rho_channels": (12, 10)}
+FEATURES: dict[str, Any] = {"feature_channels": (8, 6)}
+SMALL: dict[str, Any] = {**FEATURES, "head_channels": (12, 10)}
+MOPS_LAYERS: dict[str, Any] = {**FEATURES, "rho_channels": (12, 10)}
+ANCHORED: dict[str, Any] = {**MOPS_LAYERS, "anchors": "fps"}
+LOCAL: dict[str, Any] = {**ANCHORED, "candidates": 2, "neighbours": 3}
 
 
 def moved(sampler: MOPSNet) -> MOPSNet:
@@ -37,29 +40,25 @@ def moved(sampler: MOPSNet) -> MOPSNet:
 
 
 SAMPLERS: dict[str, Callable[..., Sampler]] = {
-    "random": lambda m, **kw: RandomSampler(m, **kw),
-    "fps": lambda m, **kw: FPSSampler(m, **kw),
-    "voxel": lambda m: VoxelSampler(m),
-    "poisson": lambda m, **kw: PoissonSampler(m, **kw),
-    "serial": lambda m: SerialSampler(m),
-    "normal_space": lambda m, **kw: NormalSpaceSampler(m, **kw),
-    "covariance": lambda m: CovarianceSampler(m),
-    "information": lambda m: InformationSampler(m),
-    "steady": lambda m: SteadySampler(m),
-    "pose": lambda m: PoseSampler(m, feature_channels=(8, 6), head_channels=(5,)),
+    "random": RandomSampler,
+    "fps": FPSSampler,
+    "voxel": VoxelSampler,
+    "poisson": PoissonSampler,
+    "serial": SerialSampler,
+    "normal_space": NormalSpaceSampler,
+    "covariance": CovarianceSampler,
+    "information": InformationSampler,
+    "steady": SteadySampler,
+    "pose": lambda m: PoseSampler(m, head_channels=(5,), **FEATURES),
     "critical": lambda m, **kw: CriticalSampler(m, PointNetVanilla(3), **kw),
-    "gumbel": lambda m: GumbelSampler(m, feature_channels=(8, 6)),
+    "gumbel": lambda m: GumbelSampler(m, **FEATURES),
     "mops": lambda m: MOPSNet(m, **MOPS_LAYERS),
     "fmops": lambda m: FMOPSNet(m, **MOPS_LAYERS),
-    "mops-anchors": lambda m: moved(MOPSNet(m, anchors="fps", **MOPS_LAYERS)),
-    "fmops-anchors": lambda m: moved(FMOPSNet(m, anchors="fps", **MOPS_LAYERS)),
+    "mops-anchors": lambda m: moved(MOPSNet(m, **ANCHORED)),
+    "fmops-anchors": lambda m: moved(FMOPSNet(m, **ANCHORED)),
     "fmops-framed": lambda m: moved(FMOPSNet(m, anchors="framed", **MOPS_LAYERS)),
-    "mops-local": lambda m: moved(
-        MOPSNet(m, anchors="fps", candidates=2, neighbours=3, **MOPS_LAYERS)
-    ),
-    "fmops-local": lambda m: moved(
-        FMOPSNet(m, anchors="fps", candidates=2, neighbours=3, **MOPS_LAYERS)
-    ),
+    "mops-local": lambda m: moved(MOPSNet(m, **LOCAL)),
+    "fmops-local": lambda m: moved(FMOPSNet(m, **LOCAL)),
     "snet": lambda m: SNet(m, **SMALL),
     "snet-without-norm": lambda m: SNet(m, head_norm=False, output_norm=False, **SMALL),
     "samplenet": lambda m: SampleNet(m, k=3, **SMALL),

@@ -67,7 +67,8 @@ def shape_of(text: str) -> Shape:
         if isinstance(node, ast.Call) and _name_of(node.func) == "UserError":
             shape.refusals += 1
     for number, line in enumerate(text.splitlines(), start=1):
-        is_code = line.strip() != "" and not line.strip().startswith("#")
+        stripped = line.strip()
+        is_code = stripped != "" and not stripped.startswith("#")
         if is_code and number not in passed_over:
             shape.lines += 1
     return shape
@@ -120,10 +121,11 @@ def main() -> None:
     long: list[str] = []
     for path in [*files_below("src"), *files_below("tests")]:
         name = path.relative_to(ROOT).as_posix()
+        top = name.partition("/")[0]
         text = path.read_text(encoding="utf-8")
         shape = shape_of(text)
         rooms.setdefault(_room(path), Shape()).add(shape)
-        totals.setdefault(name.partition("/")[0], Shape()).add(shape)
+        totals.setdefault(top, Shape()).add(shape)
         dense.append((shape.density, name))
         for function, length in long_functions(text):
             long.append(f"{name} {function}: {length} lines")

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mops_lightning.data.formats.registry import WRITERS
 from mops_lightning.data.formats.table import Table
@@ -10,7 +11,7 @@ from tests.support.hdf5 import write_file
 from tests.support.meshes import BALL, BOX, scaled, write_mesh
 
 POINTS = 1024
-
+"""Points of a cloud in ModelNet40's files."""
 
 SPLITS = ("train", "test")
 
@@ -25,7 +26,8 @@ def write_all(top: Path) -> None:
     _write_meshes(top / "meshes")
     for number in range(12):
         path = top / "mesh_sequence" / "walk" / f"{number:02d}.ply"
-        write_mesh(path, scaled(BOX, 1 + number / 9))
+        scale = 1 + number / 9
+        write_mesh(path, scaled(BOX, scale))
     _write_clouds(top / "clouds")
     write_airborne(top / "airborne" / "train" / "tile.las", 0)
     write_airborne(top / "airborne" / "test" / "tile.las", 1)
@@ -44,8 +46,9 @@ def _write_clouds(folder: Path) -> None:
     """Write six clouds of random points."""
     folder.mkdir()
     for number in range(6):
-        cloud = np.random.default_rng(number).random((3000, 3))
-        np.save(folder / f"scan{number}.npy", cloud.astype("float32"))
+        random = np.random.default_rng(number)
+        cloud = random.random((3000, 3)).astype("float32")
+        np.save(folder / f"scan{number}.npy", cloud)
 
 
 def write_airborne(path: Path, seed: int, number: int = 1000) -> None:
@@ -55,11 +58,14 @@ def write_airborne(path: Path, seed: int, number: int = 1000) -> None:
     points += (500_000, 4_000_000, 100)
     is_ground = random.random(number) < 0.6
     is_above = ~is_ground
-    points[is_above, 2] += random.uniform(2, 6, is_above.sum())
+    heights = random.uniform(2, 6, is_above.sum())
+    points[is_above, 2] += heights
+    two_or_one = np.where(is_ground, 2, 1)
+    intensity = np.where(is_ground, 40, 200)
     columns = {
-        "classification": np.where(is_ground, 2, 1).astype("uint8"),
-        "intensity": np.where(is_ground, 40, 200).astype("uint16"),
-        "return_number": np.where(is_ground, 2, 1).astype("uint8"),
+        "classification": two_or_one.astype("uint8"),
+        "intensity": intensity.astype("uint16"),
+        "return_number": two_or_one.astype("uint8"),
         "number_of_returns": np.full(number, 2, "uint8"),
     }
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -69,15 +75,18 @@ def write_airborne(path: Path, seed: int, number: int = 1000) -> None:
 def _write_modelnet40(folder: Path) -> None:
     """Write ModelNet40's files with clouds for two of its 40 classes."""
     folder.mkdir()
-    names = ["airplane", *(f"class_{number}" for number in range(1, 40))]
-    (folder / "shape_names.txt").write_text("\n".join(names) + "\n")
+    names = "airplane\n"
+    for number in range(1, 40):
+        names += f"class_{number}\n"
+    (folder / "shape_names.txt").write_text(names)
     _write_modelnet40_split(folder, "train", seed=0, number=8)
     _write_modelnet40_split(folder, "test", seed=1, number=4)
 
 
 def _write_modelnet40_split(folder: Path, split: str, seed: int, number: int) -> None:
-    points = np.random.default_rng(seed).normal(size=(number, POINTS, 3)).astype("float32")
-    radii = np.linalg.norm(points, axis=2).max(axis=1)
+    points = normal_clouds(seed, number).astype("float32")
+    norms = np.linalg.norm(points, axis=2)
+    radii = norms.max(axis=1)
     points /= radii[:, None, None]
     labels = np.arange(number)[:, None] % 2
     name = f"ply_data_{split}0.h5"
@@ -85,10 +94,16 @@ def _write_modelnet40_split(folder: Path, split: str, seed: int, number: int) ->
     (folder / f"{split}_files.txt").write_text(f"data/{folder.name}/{name}\n")
 
 
+def normal_clouds(seed: int, number: int) -> NDArray[np.float64]:
+    """Return clouds ``(number, POINTS, 3)`` of normally distributed points."""
+    random = np.random.default_rng(seed)
+    return random.normal(size=(number, POINTS, 3))
+
+
 def _write_one_class(folder: Path) -> None:
     """Write train.h5 and test.h5 of one class without names, as the paper's airplanes are."""
     folder.mkdir()
     for split, number in (("train", 8), ("test", 4)):
-        points = np.random.default_rng(number).normal(size=(number, POINTS, 3))
+        points = normal_clouds(number, number)
         labels = np.zeros(number, "int64")
         write_file(folder / f"{split}.h5", data=points.astype("float32"), label=labels)

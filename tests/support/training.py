@@ -8,12 +8,28 @@ import torch
 
 from mops_lightning.data.clouds import CloudDataset, Clouds
 
+SIDES = torch.tensor(
+    [
+        [1.0, 0.1, 0.1],
+        [0.1, 1.0, 0.1],
+        [0.3, 0.3, 0.3],
+    ]
+)
+"""Standard deviation of a blob along each axis, by label."""
+
 
 def quiet_trainer(epochs: int, **extra: Any) -> L.Trainer:
     """A CPU trainer that writes and prints nothing."""
-    quiet = dict.fromkeys(("enable_progress_bar", "enable_model_summary", "logger"), False)
-    settings = {"enable_checkpointing": False, "num_sanity_val_steps": 0, **quiet, **extra}
-    return L.Trainer(max_epochs=epochs, accelerator="cpu", **settings)
+    settings = {
+        "accelerator": "cpu",
+        "enable_progress_bar": False,
+        "enable_model_summary": False,
+        "enable_checkpointing": False,
+        "logger": False,
+        "num_sanity_val_steps": 0,
+        **extra,
+    }
+    return L.Trainer(max_epochs=epochs, **settings)
 
 
 def small_dataset(train: int = 24, test: int = 10, points: int = 48) -> CloudDataset:
@@ -22,9 +38,10 @@ def small_dataset(train: int = 24, test: int = 10, points: int = 48) -> CloudDat
 
     def clouds(number: int) -> Clouds:
         labels = torch.arange(number) % 3
-        scale = torch.tensor([[1.0, 0.1, 0.1], [0.1, 1.0, 0.1], [0.3, 0.3, 0.3]])[labels]
-        drawn = torch.randn(number, points, 3, generator=rng) * scale[:, None]
-        return Clouds(drawn, labels, parts=drawn[..., 0].gt(0).long())
+        sides = SIDES[labels]
+        blobs = torch.randn(number, points, 3, generator=rng) * sides[:, None]
+        parts = blobs[..., 0] > 0
+        return Clouds(blobs, labels, parts=parts.long())
 
     names = ("long", "tall", "round")
     parts = ("left", "right")
