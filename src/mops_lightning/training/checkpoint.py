@@ -23,6 +23,9 @@ CHECKPOINT_KEY = "mops_lightning"
 ENDING = "mops_lightning_ending"
 """Key of the ``Ending`` in a checkpoint."""
 
+THREADS = "mops_lightning_threads"
+"""Key of the number of threads of torch in a checkpoint."""
+
 LENGTH = "trainer.max_epochs"
 """The planned length of a run."""
 
@@ -71,6 +74,7 @@ class Checkpoint:
         done: epochs that it had trained.
         steps: optimizer steps that it had trained.
         ending: whether its training was told to stop before ``planned``.
+        threads: number of threads of torch; None in checkpoints of earlier versions.
     """
 
     path: Path
@@ -79,6 +83,7 @@ class Checkpoint:
     done: int
     steps: int
     ending: "Ending"
+    threads: int | None = None
 
     @classmethod
     def read(cls, path: Path) -> "Checkpoint":
@@ -97,6 +102,7 @@ class Checkpoint:
             done=int(progress["processed"]),
             steps=int(content["global_step"]),
             ending=Ending.of(content),
+            threads=content.get(THREADS),
         )
 
 

@@ -21,7 +21,7 @@ from mops_lightning.records.readout_names import FULL, PROJECTED, size_prefix
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.seeding import derive_seed
 from mops_lightning.tasks.base import Task
-from mops_lightning.training.checkpoint import CHECKPOINT_KEY, SAVED, check_finite
+from mops_lightning.training.checkpoint import CHECKPOINT_KEY, SAVED, THREADS, check_finite
 from mops_lightning.training.readouts import names_of_readouts, readouts
 from mops_lightning.training.recipe.distillation import Distillation, Targets
 from mops_lightning.training.recipe.recipe import Recipe, draw_points, straight_through
@@ -175,10 +175,11 @@ class Experiment(L.LightningModule):
         return groups
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add the run's identity; refuse a state that would replace the last finite one."""
+        """Add identity and threads; refuse a state that would replace the last finite one."""
         saved = {name: checkpoint.get(name) for name in SAVED}
         check_finite(saved, self.global_step, self.trainer.strategy)
         checkpoint[CHECKPOINT_KEY] = self.identity or {}
+        checkpoint[THREADS] = torch.get_num_threads()
 
     def on_train_start(self) -> None:
         """Set the loader to where a resumed run continues, which may be inside an epoch.

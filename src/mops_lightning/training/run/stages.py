@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import lightning as L
+import torch
 from torch import nn
 
 from mops_lightning.errors import Interrupted, UserError
@@ -15,7 +16,7 @@ from mops_lightning.records.collapse import collapsed
 from mops_lightning.records.metric_info import foreign_metrics
 from mops_lightning.records.readout_names import parse_metric_name
 from mops_lightning.records.run_record import RunRecord
-from mops_lightning.training.checkpoint import Diverged, check_finite
+from mops_lightning.training.checkpoint import Checkpoint, Diverged, check_finite
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.recipe import Recipe
 from mops_lightning.training.recipe.warm_start import warm_start_sampler
@@ -99,7 +100,10 @@ def fit(parts: Parts, record: RunRecord) -> None:
     validation = None
     if len(parts.held_out.labels) > 0:
         validation = parts.score_loader(parts.held_out)
-    checkpoint = None if resumed is None else resumed.path
+    checkpoint = None
+    if resumed is not None:
+        checkpoint = resumed.path
+        _warn_of_other_threads(resumed, trainer)
     with _interruptible():
         trainer.fit(experiment, loader, validation, ckpt_path=checkpoint)
     check_finite(dict(experiment.state_dict()), trainer.global_step, trainer.strategy)
@@ -112,6 +116,17 @@ def fit(parts: Parts, record: RunRecord) -> None:
             f"{resumed.path}: this training had ended after {resumed.done} epochs; "
             "nothing was added to it."
         )
+
+
+def _warn_of_other_threads(resumed: Checkpoint, trainer: L.Trainer) -> None:
+    """Say that a resumed training will differ, because sums are rounded in another order."""
+    threads = torch.get_num_threads()
+    if resumed.threads in (None, threads) or not trainer.is_global_zero:
+        return
+    print(
+        f"{resumed.path}: this training began with OMP_NUM_THREADS={resumed.threads} and goes on "
+        f"with {threads}. Rounding differs, and so does its result."
+    )
 
 
 def _recorded_recipe(parts: Parts) -> dict[str, Any] | None:
