@@ -14,10 +14,20 @@ import pytest
 ROOT = Path(__file__).parents[1]
 # .gitignore too: hatchling leaves out of the wheel what git ignores.
 SOURCES = ("pyproject.toml", "README.md", "LICENSE", ".gitignore", "src", "conf", "sweeps")
-TINY_JOB = "learn=task dataset=shapes dataset.train_per_class=4 dataset.test_per_class=2"
-# An installed copy compiles its loops anew; these sampled points need none.
-NO_LOOPS = "sampler=random baselines={}"
-TINY_SIZES = "dataset.n_points=64 batch_size=16 m=8 trainer=cpu trainer.max_epochs=1"
+TINY_JOB = (
+    "learn=task",
+    # An installed copy compiles its loops anew; these sampled points need none.
+    "sampler=random",
+    "baselines={}",
+    "dataset=shapes",
+    "dataset.train_per_class=4",
+    "dataset.test_per_class=2",
+    "dataset.n_points=64",
+    "batch_size=16",
+    "m=8",
+    "trainer=cpu",
+    "trainer.max_epochs=1",
+)
 
 
 def python(*arguments: str, cwd: Path, path: Path | None = None) -> str:
@@ -27,9 +37,8 @@ def python(*arguments: str, cwd: Path, path: Path | None = None) -> str:
     if path is not None:
         # Comes before site-packages and so before the editable install that is found there.
         environment["PYTHONPATH"] = str(path)
-    done = subprocess.run(
-        [sys.executable, *arguments], cwd=cwd, env=environment, capture_output=True, text=True
-    )
+    command = [sys.executable, *arguments]
+    done = subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -59,8 +68,12 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def files_below(folder: Path, inside: str) -> set[str]:
     """List the files of a folder by their expected names in the wheel."""
-    files = (file.relative_to(folder) for file in folder.rglob("*") if file.is_file())
-    return {f"{inside}/{f.as_posix()}" for f in files if "__pycache__" not in f.parts}
+    names = set()
+    for file in folder.rglob("*"):
+        path = file.relative_to(folder)
+        if file.is_file() and "__pycache__" not in path.parts:
+            names.add(f"{inside}/{path.as_posix()}")
+    return names
 
 
 def test_wheel_contains_package_configs_console_script_and_licence_only(wheel: Path) -> None:
@@ -68,26 +81,30 @@ def test_wheel_contains_package_configs_console_script_and_licence_only(wheel: P
         names = set(archive.namelist())
         (info,) = {name.split("/")[0] for name in names if ".dist-info/" in name}
         scripts = archive.read(f"{info}/entry_points.txt").decode().splitlines()
-        assert archive.read(f"{info}/licenses/LICENSE") == (ROOT / "LICENSE").read_bytes()
-    script = "mops-lightning = mops_lightning.cli.main:main"
-    assert scripts[scripts.index("[console_scripts]") + 1] == script
-    names = {name for name in names if not name.startswith(f"{info}/")}
+        licence = archive.read(f"{info}/licenses/LICENSE")
+
+    assert licence == (ROOT / "LICENSE").read_bytes()
+    title = scripts.index("[console_scripts]")
+    assert scripts[title + 1] == "mops-lightning = mops_lightning.cli.main:main"
+    packed = {name for name in names if not name.startswith(f"{info}/")}
+    package = files_below(ROOT / "src" / "mops_lightning", "mops_lightning")
+    plugins = files_below(ROOT / "src" / "hydra_plugins", "hydra_plugins")
     configs = files_below(ROOT / "conf", "mops_lightning/conf")
     sweeps = files_below(ROOT / "sweeps", "mops_lightning/sweeps")
     assert "mops_lightning/conf/config.yaml" in configs
-    assert {"mops_lightning/report/paper.json", "mops_lightning/py.typed"} <= names
     assert "mops_lightning/sweeps/modelnet40.yaml" in sweeps
-    packages = ("mops_lightning", "hydra_plugins")
-    sources = set().union(*(files_below(ROOT / "src" / name, name) for name in packages))
-    assert names == sources | configs | sweeps
+    assert "mops_lightning/report/paper.json" in packed
+    assert "mops_lightning/py.typed" in packed
+    assert packed == package | plugins | configs | sweeps
 
 
 def test_run_of_installed_copy_leaves_a_record(installed: Path, tmp_path: Path) -> None:
     elsewhere = tmp_path / "empty"
     elsewhere.mkdir()
-    folders = (f"out={tmp_path / 'out'}", f"cache={tmp_path / 'cache'}")
-    job = [*TINY_JOB.split(), *TINY_SIZES.split(), *NO_LOOPS.split(), *folders]
-    python("-m", "mops_lightning", *job, cwd=elsewhere, path=installed)
+    folders = [f"out={tmp_path / 'out'}", f"cache={tmp_path / 'cache'}"]
+
+    python("-m", "mops_lightning", *TINY_JOB, *folders, cwd=elsewhere, path=installed)
+
     (result,) = (tmp_path / "out").rglob("result.json")
     record = json.loads(result.read_text())
     assert record["status"] == "completed"
@@ -97,11 +114,10 @@ def test_run_of_installed_copy_leaves_a_record(installed: Path, tmp_path: Path) 
 
 
 def test_sweep_of_installed_copy_is_found_by_its_name(installed: Path, tmp_path: Path) -> None:
-    shown = python(
-        *("-m", "mops_lightning", "--config-name", "ablation", "--cfg", "job"),
-        cwd=tmp_path,
-        path=installed,
-    )
+    command = ["-m", "mops_lightning", "--config-name", "ablation", "--cfg", "job"]
+
+    shown = python(*command, cwd=tmp_path, path=installed)
+
     assert "n_points: 256" in shown  # of this sweep alone
 
 
@@ -109,7 +125,10 @@ def test_source_distribution_contains_every_tracked_file(tmp_path: Path) -> None
     if not (ROOT / ".git").exists() or shutil.which("git") is None:
         pytest.skip("not a git checkout")
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True)
-    tracked = {name for name in listed.stdout.split("\0") if name and (ROOT / name).is_file()}
+    tracked = set()
+    for name in listed.stdout.split("\0"):
+        if name and (ROOT / name).is_file():
+            tracked.add(name)
 
     python("-m", "build", "--sdist", "--no-isolation", "--outdir", str(tmp_path), cwd=ROOT)
 

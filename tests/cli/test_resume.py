@@ -35,28 +35,39 @@ def test_stopped_run_resumed_by_same_command_gives_same_weights(
     unbroken, tmp_path, monkeypatch, stops
 ):
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+    left = list(stops)
 
     def stop_at(place):
-        if place in stops:
-            stops.remove(place)
+        if place in left:
+            left.remove(place)
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(
         Experiment, "on_before_zero_grad", lambda self, _: stop_at(self.global_step)
     )
     monkeypatch.setattr(Experiment, "on_test_start", lambda _: stop_at("test"))
-    command, number = [*SHORT, "out=stopped"], len(stops)
-    done = [6 if place == "test" else place + 1 for place in stops]
-    for stop in range(number):
-        status, _, err = call([*command, f"hydra.run.dir=stopped/{stop}"], tmp_path)
+    command = [*SHORT, "out=stopped"]
+    for number, place in enumerate(stops):
+        folder = tmp_path / "stopped" / str(number)
+        status, _, err = call([*command, f"hydra.run.dir=stopped/{number}"], tmp_path)
         assert (status, "Traceback" in err) == (130, False), err
         assert "ckpt_path=" in err
-        assert run_record.read(tmp_path / "stopped" / str(stop)).status == "interrupted"
-        kept = tmp_path / "stopped" / str(stop) / "checkpoints" / "last.ckpt"
-        assert torch.load(kept, weights_only=True)["global_step"] == done[stop]
+        assert run_record.read(folder).status == "interrupted"
+        kept = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+        assert kept["global_step"] == steps_before(place)
         command = [*SHORT, "out=stopped", "ckpt_path=last"]
-    status, out, err = call([*command, f"hydra.run.dir=stopped/{number}"], tmp_path)
-    assert (status, "Warm start" in out) == (0, False), err
-    last = run_record.read(tmp_path / "stopped" / str(number))
-    assert last.resumed_from == f"stopped/{number - 1}/checkpoints/last.ckpt"
-    assert ended(tmp_path / "stopped" / str(number)) == unbroken
+
+    status, out, err = call([*command, "hydra.run.dir=stopped/last"], tmp_path)
+
+    assert status == 0, err
+    assert "Warm start" not in out
+    last = run_record.read(tmp_path / "stopped" / "last")
+    assert last.resumed_from == f"stopped/{len(stops) - 1}/checkpoints/last.ckpt"
+    assert ended(tmp_path / "stopped" / "last") == unbroken
+
+
+def steps_before(place):
+    """Return the steps that a run has finished when it is stopped at a place."""
+    if place == "test":
+        return 6
+    return place + 1

@@ -1,6 +1,5 @@
 """One run over two processes: the same clouds, and the same metrics as from one."""
 
-import json
 import re
 
 import pytest
@@ -10,6 +9,7 @@ from safetensors.torch import load_file
 from mops_lightning.config.compose import compose
 from mops_lightning.config.distributed import check_shares, check_start
 from mops_lightning.errors import UserError
+from mops_lightning.records import run_record
 from tests.support.command_line import SMALL_PCRNET, TINY, call, call_anew, done
 
 
@@ -25,6 +25,11 @@ from tests.support.command_line import SMALL_PCRNET, TINY, call, call_anew, done
 def test_check_shares_indivisible_sizes_raise(numbers, said):
     with pytest.raises(UserError, match=said):
         check_shares(*numbers)
+
+
+def test_check_shares_takes_the_smallest_sizes_that_can_be_shared():
+    check_shares(batch_size=8, test_clouds=4, held_out=4, processes=4)
+    check_shares(batch_size=1, test_clouds=1, held_out=0, processes=1)
 
 
 def test_check_start_unexpected_processes_raise(monkeypatch):
@@ -72,12 +77,15 @@ def test_two_processes_equal_one_and_rank_zero_writes(tmp_path):
     assert status == 0, err
     assert err == ""
     assert out.count("epoch 2/2") == out.count("completed in") == 1
-    one, both = (json.loads((tmp_path / run / "result.json").read_text()) for run in ("one", "two"))
-    assert (one["processes"], both["processes"]) == (1, 2)
-    assert both["metrics"] == pytest.approx(one["metrics"], rel=1e-4)
-    weights = [load_file(tmp_path / run / "weights.safetensors") for run in ("one", "two")]
-    for name, value in weights[0].items():
-        torch.testing.assert_close(weights[1][name], value, rtol=1e-3, atol=1e-5)
+    one = run_record.read(tmp_path / "one")
+    both = run_record.read(tmp_path / "two")
+    assert one.processes == 1
+    assert both.processes == 2
+    assert both.metrics == pytest.approx(one.metrics, rel=1e-4)
+    by_one = load_file(tmp_path / "one" / "weights.safetensors")
+    by_two = load_file(tmp_path / "two" / "weights.safetensors")
+    for name, value in by_one.items():
+        torch.testing.assert_close(by_two[name], value, rtol=1e-3, atol=1e-5)
     # Those that follow have a log of their own and nothing else.
     less = names_in(tmp_path / "one")
     more = names_in(tmp_path / "two")
@@ -92,8 +100,8 @@ def test_evaluation_by_two_processes_equals_that_by_one(tmp_path):
     status, _, err = call_anew([*again, *two], tmp_path)
 
     assert status == 0, err
-    trained, tested = (
-        json.loads((tmp_path / name / "result.json").read_text()) for name in ("trained", "two")
-    )
-    assert (tested["status"], tested["processes"]) == ("completed", 2)
-    assert tested["metrics"] == pytest.approx(trained["metrics"], rel=1e-5, abs=1e-6)
+    trained = run_record.read(tmp_path / "trained")
+    tested = run_record.read(tmp_path / "two")
+    assert tested.status == "completed"
+    assert tested.processes == 2
+    assert tested.metrics == pytest.approx(trained.metrics, rel=1e-5, abs=1e-6)

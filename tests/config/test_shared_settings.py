@@ -1,5 +1,6 @@
 from typing import Any
 
+import pytest
 from omegaconf import OmegaConf
 
 from mops_lightning.config.compose import compose
@@ -14,6 +15,52 @@ def test_training_settings_count_what_the_run_learns():
     assert alone["augment.rotate_up"] is True
     assert not begin_with(alone, "sampler", "task_lr", "pretrain.")
     assert not begin_with(joint, "augment", "dataset", "weights", "out", "logger")
+
+
+OF_TRAINING = {
+    "batch_size",
+    "evaluate",
+    "learn",
+    "optimizer",
+    "pretrain_from",
+    "recipe",
+    "seed",
+    "task",
+    "trainer",
+    "val_fraction",
+}
+"""Settings and groups that affect every training, without those that are compared by content."""
+
+OF_TABLES = {
+    "augment",
+    "batch_size",
+    "optimizer",
+    "task",
+    "test_corruption",
+    "test_noise_std",
+    "val_fraction",
+}
+"""Settings and groups in which the runs of one table must not differ."""
+
+
+@pytest.mark.parametrize(
+    ("learn", "of_training", "of_tables"),
+    [
+        ("sampler", {"pretrain", "sampler"}, {"sampler"}),
+        ("joint", {"pretrain", "sampler", "task_lr_scale"}, {"sampler", "task_lr_scale"}),
+        ("task", {"augment"}, set()),
+    ],
+)
+def test_settings_of_a_training_and_of_a_table_are_these(learn, of_training, of_tables):
+    config = plain(f"learn={learn}")
+
+    assert groups_of(training_settings(config)) == OF_TRAINING | of_training
+    assert groups_of(table_settings(config, learn)) == OF_TABLES | of_tables
+
+
+def groups_of(settings: dict[str, Any]) -> set[str]:
+    """Return the settings of the top level to which dotted settings belong."""
+    return {path.partition(".")[0] for path in settings}
 
 
 def begin_with(settings: dict[str, Any], *starts: str) -> list[str]:

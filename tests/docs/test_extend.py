@@ -50,19 +50,27 @@ def modules(tmp_path, monkeypatch):
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.split("=")[0])
 def test_example_trains_with_a_class_from_outside(command, tmp_path):
     given = command.split()
-    own_data = "dataset._target_" in command
-    tiny = [one for one in TINY if not (own_data and one.startswith("dataset."))]
+    tiny = TINY
+    if "dataset._target_" in command:
+        tiny = [argument for argument in TINY if not argument.startswith("dataset.")]
+
     status, _, err = call([*tiny, *given], tmp_path)
+
     assert (status, err) == (0, "")
     (run,) = runs(tmp_path)
     record = run_record.read(run)
     assert record.status == "completed"
     for argument in given:
         name, _, value = argument.partition("=")
-        node = record.config
-        for part in name.split("."):
-            node = node[part]
-        assert str(node) == value
+        assert str(setting_of(record, name)) == value
+
+
+def setting_of(record, path):
+    """Return the value of a setting of a run by its dotted path."""
+    node = record.config
+    for name in path.split("."):
+        node = node[name]
+    return node
 
 
 @pytest.mark.usefixtures("modules")
@@ -71,12 +79,22 @@ def test_run_of_own_sampler_is_evaluated_with_its_class_only(tmp_path):
     status, _, err = call([*TINY, named, setting], tmp_path)
     assert (status, err) == (0, "")
     (run,) = runs(tmp_path)
+
     status, _, err = call([f"evaluate={run}"], tmp_path)
+
     assert status == 2
     assert "not accepted from a record" in err
+
     again = [f"evaluate={run}", named, "pictures=0", "trainer=cpu", "hydra.run.dir=again"]
     status, _, err = call(again, tmp_path)
+
     assert (status, err) == (0, "")
-    assert run_record.read(tmp_path / "again").score == run_record.read(run).score
-    own = sys.modules["my_sampler"].MySampler
-    assert load(run, cls=own)(torch.rand(2, 64, 3)).points.shape == (2, 8, 3)
+    evaluated = run_record.read(tmp_path / "again")
+    trained = run_record.read(run)
+    assert evaluated.score == trained.score
+
+    own_class = sys.modules["my_sampler"].MySampler
+    sampler = load(run, cls=own_class)
+    sampled = sampler(torch.rand(2, 64, 3))
+
+    assert sampled.points.shape == (2, 8, 3)

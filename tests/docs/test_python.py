@@ -22,25 +22,38 @@ def example(title):
 
 def test_labels_come_back_to_all_points():
     names: dict[str, Any] = {}
+
     exec(example("Back to all points"), names)
-    labels, points = names["labels"], names["points"]
-    assert (labels.shape, labels.dtype) == ((4096,), torch.bool)
-    assert ((points[:, 0] > 0.5) == labels).float().mean() > 0.9
+
+    labels = names["labels"]
+    assert labels.shape == (4096,)
+    assert labels.dtype == torch.bool
+    expected = names["points"][:, 0] > 0.5
+    is_right = labels == expected
+    assert is_right.float().mean() > 0.9
 
 
 def test_node_attributes_follow_in_pytorch_geometric():
-    data = pytest.importorskip("torch_geometric.data").Data(pos=torch.rand(300, 3))
+    graphs = pytest.importorskip("torch_geometric.data")
+    data = graphs.Data(pos=torch.rand(300, 3))
     data.row = torch.arange(300)
     names: dict[str, Any] = {"data": data, "mops_lightning": mops_lightning}
+
     exec(example("PyTorch Geometric"), names)
-    assert torch.equal(data.pos[names["data"].row], names["data"].pos)
-    assert len(names["data"].pos) == 100
+
+    sampled = names["data"]
+    assert torch.equal(data.pos[sampled.row], sampled.pos)
+    assert len(sampled.pos) == 100
 
 
 def test_pointnet2_layer_runs_with_one_import_replaced():
     pytest.importorskip("torch_geometric", reason="torch_geometric is in the extra test")
     names: dict[str, Any] = {}
+
     exec(example("Farthest points"), names)
-    assert names["x"].shape == (768, 64)
-    assert names["batch"].bincount().tolist() == [256] * 3
-    names["x"].sum().backward()
+
+    features = names["x"]
+    assert features.shape == (768, 64)
+    points_of_clouds = names["batch"].bincount()
+    assert points_of_clouds.tolist() == [256] * 3
+    features.sum().backward()

@@ -54,6 +54,14 @@ def test_joint_runs_have_own_task_nets(tmp_path):
     assert labels(text) == ["sampled by", "snet", "mops"]
     assert "pointnet on all points after joint training with snet, m=32: 90.00" in text
 
+    several = {"test/m8/generated/accuracy": 0.4, "test/m32/generated/accuracy": 0.5}
+    joint = {"task_weights_sha256": "fmops", "evaluated": evaluated(learn="joint")}
+    put(tmp_path, "fmops", 32, {**several, "test/full/accuracy": 0.8}, **joint)
+
+    text = table(tmp_path)
+
+    assert "pointnet on all points after joint training with fmops: 80.00" in text
+
     put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
 
     joint_title, other = sorted(titles(table(tmp_path)))
@@ -264,7 +272,7 @@ def test_same_samples_under_several_nets_have_column_per_net(tmp_path):
     ]
 
 
-@pytest.mark.parametrize("columns", [3, 9, 12])
+@pytest.mark.parametrize("columns", [3, 8, 9, 12])
 def test_any_number_of_noise_levels_gives_a_table_of_all(tmp_path, columns):
     levels = [round(0.01 * number, 2) for number in range(columns)]
     for level in levels:

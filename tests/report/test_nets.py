@@ -9,7 +9,9 @@ from tests.support.reports import DEGREES, edited, put, put_net, rows, table
 def test_nets_grid_has_row_per_net(tmp_path):
     put_net(tmp_path, "first", {DEGREES: 7.5}, "registration", iterations=1)
     put_net(tmp_path, "second", {DEGREES: 6.5}, "registration", iterations=8)
+
     text = table(tmp_path)
+
     assert text.startswith("No sampler was tested; registration on modelnet40 from all points.")
     assert rows(text) == [
         ["net", "iterations", "points", "rotation error (°)", "MB", "*the paper's*"],
@@ -31,39 +33,53 @@ def test_nets_grid_of_two_seeds_shows_mean_and_deviation(tmp_path):
     put_net(tmp_path, "first", {DEGREES: 6.5}, "registration")
     path = put_net(tmp_path, "second", {DEGREES: 6.0}, "registration")
     assert len(rows(table(tmp_path))) == 2, "the later run of a seed counts"
+
     edited(path, seed=1)
-    assert rows(table(tmp_path))[1][2] == "6.25 ± 0.35 (n=2)"
+
+    _, line = rows(table(tmp_path))
+    assert line[2] == "6.25 ± 0.35 (n=2)"
 
 
 def test_nets_of_differing_settings_share_a_table_if_mixed(tmp_path):
     put_net(tmp_path, "first", {DEGREES: 6.5}, "registration", iterations=1)
     path = put_net(tmp_path, "second", {DEGREES: 6.0}, "registration", iterations=8)
-    edited(path, config={**json.loads(path.read_text())["config"], "batch_size": 7})
+    config = json.loads(path.read_text())["config"]
+    edited(path, config={**config, "batch_size": 7})
     put_net(tmp_path, "third", {DEGREES: 6.2}, "registration", iterations=8)
-    text = table(tmp_path)
-    assert text.count("No sampler was tested") == 2
-    assert "(batch_size=7)" in text
-    assert [row[4] for row in rows(table(tmp_path, mixed=True))[1:]] == ["6.00", "6.50", "6.20"]
+
+    apart = table(tmp_path)
+    together = table(tmp_path, mixed=True)
+
+    assert apart.count("No sampler was tested") == 2
+    assert "(batch_size=7)" in apart
+    _, *lines = rows(together)
+    assert [line[4] for line in lines] == ["6.00", "6.50", "6.20"]
 
 
 def test_nets_of_two_tasks_have_tables_of_their_own(tmp_path):
     put_net(tmp_path, "first", {DEGREES: 7.5}, "registration")
     put_net(tmp_path, "second", {"accuracy": 0.5}, "classification", "pointnet")
-    heads = [row for row in rows(table(tmp_path)) if row[0] == "net"]
-    assert [head[2] for head in heads] == ["rotation error (°)", "accuracy (%)"]
+
+    text = table(tmp_path)
+
+    metrics = [row[2] for row in rows(text) if row[0] == "net"]
+    assert metrics == ["rotation error (°)", "accuracy (%)"]
 
 
 def test_nets_grid_reconstruction_shows_paper(tmp_path):
     distances = {"nre_cd": 1.0, "chamfer": 0.00123, "emd": 0.05}
+    nets = {16: "mfoldingnet", 1: "foldingnet", 8: "mfoldingnet"}
     for points in (10000, 1024):
-        for pieces in (16, 1, 8):
-            net = "mfoldingnet" if pieces > 1 else "foldingnet"
+        for pieces, net in nets.items():
             given = ("reconstruction", net, points)
             put_net(tmp_path, f"m{pieces}", distances, *given, pieces=pieces)
     put_net(tmp_path, "mlp", distances, "reconstruction", "autoencoder")
+
     found = rows(table(tmp_path))
-    assert found[0] == ["net", "pieces", "points", "chamfer", "emd", "MB", "*the paper's*"]
-    assert [row[:3] for row in found[1:]] == [
+
+    head, *lines = found
+    assert head == ["net", "pieces", "points", "chamfer", "emd", "MB", "*the paper's*"]
+    assert [line[:3] for line in lines] == [
         ["autoencoder", "", "1024"],
         ["foldingnet", "1", "1024"],
         ["mfoldingnet", "8", "1024"],
@@ -77,12 +93,17 @@ def test_nets_grid_reconstruction_shows_paper(tmp_path):
 
 
 def test_nets_grid_names_samplers_inside_and_shows_no_figure_of_another_net(tmp_path):
-    fps = {"_target_": "mops_lightning.samplers.fps.FPSSampler", "m": 16}
-    mops = {"_target_": "mops_lightning.samplers.mops.MOPSNet", "m": 16, "anchors": None}
-    for sampler in (fps, mops, {**mops, "anchors": "fps"}):
-        name = f"{sampler['_target_']}-{sampler.get('anchors')}"
+    fps = "mops_lightning.samplers.fps.FPSSampler"
+    mops = "mops_lightning.samplers.mops.MOPSNet"
+    samplers = {
+        "fps": {"_target_": fps, "m": 16},
+        "free": {"_target_": mops, "m": 16, "anchors": None},
+        "anchored": {"_target_": mops, "m": 16, "anchors": "fps"},
+    }
+    for name, sampler in samplers.items():
         given = (tmp_path, name, {"accuracy": 0.5}, "classification", "hierarchical")
         put_net(*given, sampler=sampler)
+
     assert rows(table(tmp_path)) == [
         ["net", "sampler", "sampler.anchors", "points", "accuracy (%)", "MB"],
         ["hierarchical", "fps", "", "1024", "50.00", "4.1"],

@@ -14,12 +14,26 @@ from tests.support.reports import put, put_planes
 
 def cells(page, table=0):
     """The visible texts in the body of a table."""
-    found = page.locator("table").nth(table).locator("tbody tr")
-    return [row.locator("td").all_inner_texts() for row in found.all()]
+    body = page.locator("table").nth(table)
+    texts = []
+    for row in body.locator("tbody tr").all():
+        texts.append(row.locator("td").all_inner_texts())
+    return texts
 
 
 def names(page):
-    return [row[0].splitlines()[0] for row in cells(page)]
+    """The first line of the first cell of every row."""
+    first_cells = [row[0] for row in cells(page)]
+    return [cell.splitlines()[0] for cell in first_cells]
+
+
+def kinds(requests):
+    """The kinds of addresses that a page asked for."""
+    return {address.partition(":")[0] for address in requests}
+
+
+LOCAL = {"file", "data", "blob"}
+"""Kinds of addresses that leave the machine alone."""
 
 
 @pytest.fixture(scope="module")
@@ -29,14 +43,12 @@ def reported(tmp_path_factory):
     rng = torch.Generator().manual_seed(0)
     put(tmp_path, "fps", 8, {"test/sampled/accuracy": 0.4})
     put(tmp_path, "voxel", 32, {"test/sampled/accuracy": 0.055})
-    pictured = {
-        "fps": {"test/sampled/accuracy": 0.3, "test/full/accuracy": 0.9},
-        "mops": {"test/generated/accuracy": 0.8, "test/matched/accuracy": 0.77},
-    }
-    for sampler, metrics in pictured.items():
+    of_fps = {"test/sampled/accuracy": 0.3, "test/full/accuracy": 0.9}
+    of_mops = {"test/generated/accuracy": 0.8, "test/matched/accuracy": 0.77}
+    for sampler, readout, metrics in (("fps", "sampled", of_fps), ("mops", "generated", of_mops)):
         path = put(tmp_path, sampler, 32, metrics, files={"clouds": "clouds.npz"})
         points = torch.rand(2, 50, 3, generator=rng)
-        drawn = {next(iter(metrics)).split("/")[1]: points[:, :8]}
+        drawn = {readout: points[:, :8]}
         save_clouds(path.parent / "clouds.npz", points, drawn, ["0_chair", "1_</script>"])
     main([str(tmp_path)])
     return tmp_path / "report.html"
@@ -52,18 +64,24 @@ def shown(reported, opened_once):
 
 def test_page_tables_sort_by_column(shown):
     page, errors, requests = shown
-    before = cells(page)
+    of_size = page.get_by_role("columnheader", name="m=32")
+    of_name = page.get_by_role("columnheader", name="sampled by")
+
     assert names(page) == ["voxel", "fps", "mops"]
-    assert before[1] == ["fps\nthe paper's", "30.00\n34.08", "40.00\n11.02"]
-    page.get_by_role("columnheader", name="m=32").click()
+    assert cells(page)[1] == ["fps\nthe paper's", "30.00\n34.08", "40.00\n11.02"]
+
+    of_size.click()
     assert names(page) == ["voxel", "fps", "mops"]
-    page.get_by_role("columnheader", name="m=32").click()
+
+    of_size.click()
     assert names(page) == ["mops", "fps", "voxel"]
-    page.get_by_role("columnheader", name="sampled by").click()
+
+    of_name.click()
     assert names(page) == ["fps", "mops", "voxel"]
+
     assert page.locator("img").evaluate("image => image.naturalWidth") > 300
     assert errors == []
-    assert {url.split(":")[0] for url in requests} <= {"file", "data", "blob"}
+    assert kinds(requests) <= LOCAL
 
 
 def test_page_clouds_can_be_selected(shown):
@@ -72,16 +90,20 @@ def test_page_clouds_can_be_selected(shown):
     assert page.locator("#shape option").all_inner_texts() == ["0_chair", "1_</script>"]
     traces = "document.getElementById('view').data.map(trace => [trace.name, trace.x.length])"
     assert page.evaluate(traces) == [["input", 50], ["sampled", 8]]
+
     page.select_option("#run", "1")
     page.select_option("#shape", "1")
     assert page.evaluate(traces) == [["input", 50], ["generated", 8]]
-    drawn = page.locator("#view").screenshot()
+
+    view = page.locator("#view")
+    drawn = view.screenshot()
     page.evaluate("Plotly.restyle('view', {visible: false})")
     page.wait_for_timeout(300)
-    assert page.locator("#view").screenshot() != drawn, "the canvas must show the points"
+    assert view.screenshot() != drawn, "the canvas must show the points"
+
     page.evaluate("Plotly.restyle('view', {visible: true})")  # for the tests that follow
     assert errors == []
-    assert {url.split(":")[0] for url in requests} <= {"file", "data", "blob"}
+    assert kinds(requests) <= LOCAL
 
 
 def test_page_planes_have_table_and_plot(tmp_path, opened):
@@ -98,8 +120,11 @@ def test_page_runs_its_own_scripts_only(reported):
     text = reported.read_text()
     (policy,) = re.findall('Content-Security-Policy" content="([^"]*)"', text)
     assert "default-src 'none'" in policy
-    scripts = re.findall("<script>(.*?)</script>", text, re.DOTALL)
-    digests = {base64.b64encode(hashlib.sha256(one.encode()).digest()).decode() for one in scripts}
-    assert digests == set(re.findall("'sha256-([^']*)'", policy))
+    digests = set()
+    for script in re.findall("<script>(.*?)</script>", text, re.DOTALL):
+        digest = hashlib.sha256(script.encode()).digest()
+        digests.add(base64.b64encode(digest).decode())
+    allowed = re.findall("'sha256-([^']*)'", policy)
+    assert digests == set(allowed)
     assert len(digests) == 2
     assert '<meta name="viewport"' in text

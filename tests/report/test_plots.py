@@ -65,6 +65,20 @@ def curves_of(axes: Any) -> list[list[float]]:
     return [container.lines[0].get_ydata().tolist() for container in axes.containers]
 
 
+def test_curves_of_two_groups_have_names_of_their_own(tmp_path):
+    for fingerprint, value in (("first", 0.3), ("second", 0.6)):
+        for m in (8, 32):
+            scores = {"test/sampled/accuracy": value}
+            put(tmp_path / fingerprint, "fps", m, scores, dataset_fingerprint=fingerprint)
+
+    figures = plots(build_report(tmp_path))
+
+    assert list(figures) == ["accuracy_curves", "accuracy_curves_2"]
+    first, second = figures.values()
+    assert curves_of(first.axes[0]) == [[30, 30]]
+    assert curves_of(second.axes[0]) == [[60, 60]]
+
+
 def test_curves_have_error_bars_in_the_unit_of_the_values(tmp_path):
     for m in (8, 32):
         put(tmp_path / "0", "fps", m, {"test/sampled/accuracy": 0.5}, seed=0)

@@ -4,7 +4,6 @@ import io
 import pickle
 import signal
 from functools import cache, partial
-from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -65,7 +64,12 @@ class SmallNet(nn.Module):
     def __init__(self):
         super().__init__()
         self.features = nn.Linear(3, 16)
-        self.head = nn.Sequential(nn.BatchNorm1d(16), nn.ReLU(), nn.Dropout(), nn.Linear(16, 3))
+        self.head = nn.Sequential(
+            nn.BatchNorm1d(16),
+            nn.ReLU(),
+            nn.Dropout(),
+            nn.Linear(16, 3),
+        )
 
     def forward(self, points):
         return self.head(self.features(points).amax(1))
@@ -79,7 +83,8 @@ class StopAt(Callback):
     """Sends Ctrl-C, or kills the run, when a hook has come after some training steps."""
 
     def __init__(self, stop, steps):
-        (self.kind, self.place), self.left = stop, steps
+        self.kind, self.place = stop
+        self.left = steps
 
     def _reach(self, place):
         if place == self.place and self.left <= 0:
@@ -90,7 +95,10 @@ class StopAt(Callback):
 
     def on_train_batch_start(self, trainer, pl_module, batch, batch_idx):
         self.left -= 1
-        self._reach("last step" if batch_idx + 1 == trainer.num_training_batches else "step")
+        place = "step"
+        if batch_idx + 1 == trainer.num_training_batches:
+            place = "last step"
+        self._reach(place)
 
     def on_validation_start(self, trainer, pl_module):
         self._reach("validation")
@@ -102,41 +110,74 @@ class StopAt(Callback):
         self._reach("test")
 
 
-PLACES = ("step", "last step", "validation", "epoch end")
-STOPS = [*product(("ctrl-c", "kill"), PLACES), ("kill", "test")]
-NUMBERS = range(len(STOPS))
-IN_TURN = [n for i in NUMBERS for n in (i, *(k for j in NUMBERS[i + 1 :] for k in (i, j)))]
-"""Numbers of stops such that each one follows each, itself too, once: a de Bruijn sequence."""
+STOPS = [
+    ("ctrl-c", "step"),
+    ("ctrl-c", "last step"),
+    ("ctrl-c", "validation"),
+    ("ctrl-c", "epoch end"),
+    ("kill", "step"),
+    ("kill", "last step"),
+    ("kill", "validation"),
+    ("kill", "epoch end"),
+    ("kill", "test"),
+]
+
+
+def each_after_each(items):
+    """Return items so that each one follows each, itself too, once: a de Bruijn sequence."""
+    in_turn = []
+    for number, item in enumerate(items):
+        in_turn.append(item)
+        for later in items[number + 1 :]:
+            in_turn += [item, later]
+    return in_turn
+
+
+IN_TURN = each_after_each(STOPS)
 
 
 def attempt(setting: Setting, path: Path, *callbacks: Callback) -> Any:
     """Train and test from ``path`` where it exists: the final weights, None if it was stopped."""
     learn, fast, steps, accumulated = setting
     torch.manual_seed(0)
-    sampler = MOPSNet(4, feature_channels=(4, 4), rho_channels=(8, 4))
-    recipe = Recipe(ema_span=0.3, train_points=16, all_points_from=0.5, distillation=1.0)
+    sampler: MOPSNet | None = MOPSNet(4, feature_channels=(4, 4), rho_channels=(8, 4))
+    if learn == "task":
+        sampler = None
+    optimizer: Any = partial(Adam, lr=1e-2)
+    recipe = Recipe()
+    average: list[Callback] = []
+    if fast:
+        optimizer = partial(MuonAdam, smallest=3, lr=1e-2)
+        recipe = Recipe(ema_span=0.3, train_points=16, all_points_from=0.5, distillation=1.0)
+        average = [MovingAverage(0.3)]
     module = Experiment(
         Classification(SmallNet(), 3),
-        None if learn == "task" else sampler,
+        sampler,
         learn,
-        make_optimizer=partial(MuonAdam, smallest=3, lr=1e-2) if fast else partial(Adam, lr=1e-2),
+        make_optimizer=optimizer,
         make_schedule=one_cycle,
-        recipe=recipe if fast else None,
+        recipe=recipe,
     )
-    average = [MovingAverage(0.3)] if fast else []
-    callbacks = (*average, *callbacks, last_checkpoint(path), StopWithCheckpoint(path))
     trainer = quiet_trainer(
         EPOCHS,
-        callbacks=list(callbacks),
+        callbacks=[*average, *callbacks, last_checkpoint(path), StopWithCheckpoint(path)],
         enable_checkpointing=True,
         accumulate_grad_batches=accumulated,
     )
     data = small_dataset(train=CLOUDS, test=3, points=24)
-    augment = Augmentation(rotate_up=True, jitter=0.01)
+    train = CloudLoader(
+        data.train,
+        CLOUDS // steps,
+        shuffle=True,
+        augment=Augmentation(rotate_up=True, jitter=0.01),
+        drop_last=True,
+    )
     test = CloudLoader(data.test, 3)
-    train = CloudLoader(data.train, CLOUDS // steps, shuffle=True, augment=augment, drop_last=True)
+    checkpoint = None
+    if path.is_file():
+        checkpoint = path
     try:
-        trainer.fit(module, train, test, ckpt_path=path if path.is_file() else None)
+        trainer.fit(module, train, test, ckpt_path=checkpoint)
         trainer.test(module, test, verbose=False)
     except (Interrupted, Killed):
         return None
@@ -145,23 +186,35 @@ def attempt(setting: Setting, path: Path, *callbacks: Callback) -> Any:
 
 @pytest.fixture(scope="module")
 def unbroken(tmp_path_factory):
+    """A function that returns the weights of a training without a stop, which is run once."""
     folder = tmp_path_factory.mktemp("unbroken")
-    return cache(lambda setting: attempt(setting, folder / str(setting) / "last.ckpt"))
+
+    @cache
+    def run_once(setting):
+        return attempt(setting, folder / str(setting) / "last.ckpt")
+
+    return run_once
 
 
 def assert_same(state, want):
-    assert [name for name in want if not torch.equal(want[name], state[name])] == []
+    for name, value in want.items():
+        assert torch.equal(state[name], value), name
 
 
 @pytest.mark.parametrize("number", range(0, len(IN_TURN), 2))
 def test_run_stopped_three_times_resumes_to_same_weights(unbroken, tmp_path, number):
-    setting, path = SETTINGS[number // 2 % len(SETTINGS)], tmp_path / "last.ckpt"
-    for steps, stop in zip((2, 1, 1), (*IN_TURN, *IN_TURN[:2])[number:][:3], strict=True):
-        state = attempt(setting, path, StopAt(STOPS[stop], steps))
-        if state is not None:  # the stop's place was not reached
-            break
-    else:
+    path = tmp_path / "last.ckpt"
+    setting = SETTINGS[number // 2 % len(SETTINGS)]
+    around = [*IN_TURN, *IN_TURN]
+    first, second, third = around[number : number + 3]
+
+    state = attempt(setting, path, StopAt(first, steps=2))
+    for stop in (second, third):
+        if state is None:  # otherwise the place of the last stop was not reached
+            state = attempt(setting, path, StopAt(stop, steps=1))
+    if state is None:
         state = attempt(setting, path)
+
     assert_same(state, unbroken(setting))
 
 
@@ -169,17 +222,28 @@ def test_run_stopped_three_times_resumes_to_same_weights(unbroken, tmp_path, num
 def test_completed_run_resumes_to_same_weights(unbroken, tmp_path, setting):
     path = tmp_path / "last.ckpt"
     attempt(setting, path)
-    assert_same(attempt(setting, path), unbroken(setting))
+
+    again = attempt(setting, path)
+
+    assert_same(again, unbroken(setting))
 
 
 def test_checkpoint_written_in_last_step_of_epoch_resumes_to_same_weights(unbroken, tmp_path):
-    setting, path = Setting("joint"), tmp_path / "last.ckpt"
+    path = tmp_path / "last.ckpt"
+    setting = Setting("joint")
     saves = ModelCheckpoint(
-        dirpath=tmp_path, filename="last", every_n_train_steps=3, enable_version_counter=False
+        dirpath=tmp_path,
+        filename="last",
+        every_n_train_steps=3,
+        enable_version_counter=False,
     )
     attempt(setting, path, saves, StopAt(("kill", "validation"), 3))
-    assert attempt(setting, path, StopAt(("ctrl-c", "step"), 2)) is None
-    assert_same(attempt(setting, path), unbroken(setting))
+
+    stopped = attempt(setting, path, StopAt(("ctrl-c", "step"), 2))
+    state = attempt(setting, path)
+
+    assert stopped is None
+    assert_same(state, unbroken(setting))
 
 
 class Touch:
@@ -192,9 +256,15 @@ class Touch:
 
 @pytest.mark.parametrize("plain", [True, False])
 def test_read_sealed_runs_no_pickled_code(plain, tmp_path):
-    content, path, buffer = {"state": Touch(tmp_path / "ran")}, tmp_path / "a.ckpt", io.BytesIO()
-    torch.save(content, buffer)
-    path.write_bytes(sealed(pickle.dumps(content) if plain else buffer.getvalue()))
+    content = {"state": Touch(tmp_path / "ran")}
+    written = pickle.dumps(content)
+    if not plain:
+        buffer = io.BytesIO()
+        torch.save(content, buffer)
+        written = buffer.getvalue()
+    path = tmp_path / "a.ckpt"
+    path.write_bytes(sealed(written))
+
     with pytest.raises(UserError, match="expected a checkpoint of plain data"):
         read_sealed(path)
     assert not (tmp_path / "ran").exists()
@@ -203,13 +273,23 @@ def test_read_sealed_runs_no_pickled_code(plain, tmp_path):
 @pytest.mark.parametrize("change", ["byte", "cut", "saved again", "empty"])
 def test_read_sealed_of_a_changed_checkpoint_raises(change, tmp_path):
     path = tmp_path / "last.ckpt"
-    AtomicCheckpointIO().save_checkpoint({"epoch": 3, "weight": torch.ones(50)}, path)
+    weight = torch.ones(50)
+    AtomicCheckpointIO().save_checkpoint({"epoch": 3, "weight": weight}, path)
     assert read_sealed(path)["epoch"] == 3
-    written = bytearray(path.read_bytes())
+    written = path.read_bytes()
+
     if change == "saved again":
-        torch.save({**torch.load(path), "epoch": 2}, path)
+        content = torch.load(path)
+        content["epoch"] = 2
+        torch.save(content, path)
+    elif change == "byte":
+        flipped = bytearray(written)
+        flipped[written.index(weight.numpy().tobytes())] ^= 1
+        path.write_bytes(flipped)
+    elif change == "cut":
+        path.write_bytes(written[:-1])
     else:
-        written[written.index(torch.ones(50).numpy().tobytes())] ^= 1
-        path.write_bytes({"byte": written, "cut": written[:-1], "empty": b""}[change])
+        path.write_bytes(b"")
+
     with pytest.raises(UserError, match=r"last\.ckpt is damaged .*expected a checkpoint as"):
         read_sealed(path)

@@ -15,14 +15,17 @@ STRATEGY = SingleDeviceStrategy()
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 def test_check_finite_names_the_first_value_that_is_not(value):
-    good: dict[str, Any] = {
+    moments = torch.ones(2)
+    values: dict[str, Any] = {
         "weights": {"w": torch.ones(2), "n": torch.tensor(1)},
-        "optimizer": [{"state": {0: {"exp_avg": torch.ones(2)}}, "param_groups": [{}]}],
+        "optimizer": [{"state": {0: {"exp_avg": moments}}, "param_groups": [{}]}],
     }
-    check_finite(good, 7, STRATEGY)
-    good["optimizer"][0]["state"][0]["exp_avg"][1] = value
+    check_finite(values, 7, STRATEGY)
+
+    moments[1] = value
+
     with pytest.raises(Diverged, match=r"optimizer\.0\.state\.0\.exp_avg is not finite at step 7"):
-        check_finite(good, 7, STRATEGY)
+        check_finite(values, 7, STRATEGY)
 
 
 def test_run_diverged_keeps_last_finite_checkpoint(tmp_path):
@@ -31,8 +34,10 @@ def test_run_diverged_keeps_last_finite_checkpoint(tmp_path):
     # The rate explodes after the first epoch.
     rising = ["optimizer=exponential", "optimizer.schedule.end_lr=1e18"]
     said = rf"training diverged(.|\n)*last finite checkpoint is {path}"
+
     with pytest.raises(UserError, match=said):
         job(folder, "weights=null", "trainer.max_epochs=3", *rising)
+
     content = torch.load(path, weights_only=True)
     assert weights.first_nonfinite(content["state_dict"]) is None
     assert content["epoch"] < 2

@@ -24,18 +24,27 @@ def experiment(learn="sampler", sampler=True, **extra):
     )
 
 
-@pytest.mark.parametrize(("learn", "rates"), [("joint", [1e-2, 1e-3]), ("sampler", [1e-2])])
+@pytest.mark.parametrize(
+    ("learn", "rates"),
+    [
+        ("joint", {"sampler": 1e-2, "task": 1e-3}),
+        ("sampler", {"sampler": 1e-2}),
+        ("task", {"task": 1e-2}),
+    ],
+)
 def test_task_lr_scale_joint_scales_task_rate(learn, rates):
     module = experiment(learn, task_lr_scale=0.1)
     data = small_dataset()
+    train = CloudLoader(data.train, 6)
+    val = CloudLoader(data.test, 6)
 
-    quiet_trainer(1).fit(module, CloudLoader(data.train, 6), CloudLoader(data.test, 6))
+    quiet_trainer(1, limit_train_batches=1).fit(module, train, val)
 
     groups = module.optimizers().param_groups
-    assert [group["lr"] for group in groups] == pytest.approx(rates)
-    learned = [module.sampler, module.task] if learn == "joint" else [module.sampler]
-    for group, part in zip(groups, learned, strict=True):
-        assert ids(group["params"]) == ids(part.parameters())
+    assert {group["name"]: group["lr"] for group in groups} == pytest.approx(rates)
+    for group in groups:
+        learned = module.get_submodule(group["name"])
+        assert ids(group["params"]) == ids(learned.parameters())
 
 
 def ids(parameters):
@@ -44,11 +53,14 @@ def ids(parameters):
 
 def test_train_frozen_parts_stay_in_evaluation_mode():
     module = experiment("sampler").train()
+    joint = experiment("joint").train()
 
-    assert not any(m.training for m in module.task.modules())
     assert module.sampler.training
-    assert not any(p.requires_grad for p in module.task.parameters())
-    assert experiment("joint").train().task.training
+    for part in module.task.modules():
+        assert not part.training
+    for parameter in module.task.parameters():
+        assert not parameter.requires_grad
+    assert joint.task.training
 
 
 def test_learn_without_sampler_or_optimizer_raises():

@@ -187,6 +187,12 @@ def test_validation_scores_readouts_at_own_size(sampler):
     assert scores(trainer) == pytest.approx(with_prefix("val/", expected), abs=1e-4)
 
 
+@pytest.mark.parametrize("sampler", ["fmops"], indirect=True)
+def test_score_is_that_of_own_size_among_several(sampler):
+    assert experiment(sampler, m=5).score_name == "test/m5/generated/fingerprint"
+    assert experiment(sampler, m=8).score_name == "test/m8/generated/fingerprint"
+
+
 @pytest.mark.parametrize("sampler", ["fmops", "fps"], indirect=True)
 def test_loss_of_each_size_is_that_of_main_readout(sampler):
     clouds = numbered_clouds().test

@@ -177,6 +177,16 @@ def test_straight_through_losses_are_means_over_generated_and_matched_points(cal
     assert logged["train/generated/fingerprint"] == pytest.approx(scored, abs=1e-4)
 
 
+def test_step_at_several_sizes_sees_twice_the_points_of_the_largest(calls):
+    sampler = noting(FMOPSNet, 16, **MOPS)
+
+    fitted(sampler, recipe=Recipe(train_points=10), **ONE_STEP)
+
+    ((_, seen, _),) = sampler.samples
+    assert seen.shape[1] == 2 * 16
+    assert min(sizes_of(calls)) < 16
+
+
 def test_straight_through_begins_at_its_share_of_the_training(calls):
     recipe = Recipe(straight_through=0.5)
 

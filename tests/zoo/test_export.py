@@ -10,11 +10,13 @@ from mops_lightning.errors import UserError
 from mops_lightning.zoo.export import export
 
 SMALL: dict[str, Any] = {"feature_channels": (8, 8), "rho_channels": (16, 8)}
+SMALL_SNET: dict[str, Any] = {"feature_channels": (8, 8), "head_channels": (8,)}
 SIZES = ((1, 12), (4, 100), (2, 257))
 
 
 def clouds(number, points):
-    return torch.rand(number, points, 3, generator=torch.Generator().manual_seed(points)) - 0.5
+    rng = torch.Generator().manual_seed(points)
+    return torch.rand(number, points, 3, generator=rng) - 0.5
 
 
 @pytest.mark.parametrize(
@@ -22,21 +24,24 @@ def clouds(number, points):
     [
         (MOPSNet(8, **SMALL), None),
         (FMOPSNet(12, **SMALL), 5),
-        (SNet(8, feature_channels=(8, 8), head_channels=(8,)), None),
-        (SNet(8, feature_channels=(8, 8), head_channels=(8,), head_norm=False), None),
-        (SampleNet(8, feature_channels=(8, 8), head_channels=(8,), output_norm=False), None),
+        (SNet(8, **SMALL_SNET), None),
+        (SNet(8, head_norm=False, **SMALL_SNET), None),
+        (SampleNet(8, output_norm=False, **SMALL_SNET), None),
     ],
     ids=lambda value: type(value).__name__,
 )
 def test_exported_program_equals_the_sampler_at_any_size(sampler, m, tmp_path):
     sampler(clouds(4, 50)).points.sum()  # running statistics
     sampler.eval()
+
     export(sampler, tmp_path / "net.pt2", m)
+
     program = torch.export.load(tmp_path / "net.pt2").module()
     with torch.no_grad():
         for shape in SIZES:
             points = clouds(*shape)
-            assert torch.allclose(program(points), sampler(points, m).points, atol=1e-5)
+            expected = sampler(points, m).points
+            assert torch.allclose(program(points), expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("shape", [(1, 2**20), (40, 2**15)])
@@ -47,21 +52,26 @@ def test_exported_program_takes_more_points_than_s_has_entries_in_one_piece(shap
     export(sampler, tmp_path / "net.pt2")
 
     with torch.no_grad():
-        generated = torch.export.load(tmp_path / "net.pt2").module()(points)
-        assert torch.allclose(generated, sampler(points).points, atol=1e-5)
+        program = torch.export.load(tmp_path / "net.pt2").module()
+        expected = sampler(points).points
+        assert torch.allclose(program(points), expected, atol=1e-5)
 
 
 def test_onnx_file_equals_the_model_at_any_size(tmp_path):
     pytest.importorskip("onnxscript", reason="extra onnx")
     onnxruntime = pytest.importorskip("onnxruntime", reason="extra onnx")
     sampler = load("mops.modelnet40-m32")
-    assert export(sampler, tmp_path / "net.onnx") < 1e-5
+
+    difference = export(sampler, tmp_path / "net.onnx")
+
+    assert difference < 1e-5
     session = onnxruntime.InferenceSession(tmp_path / "net.onnx")
-    for shape in SIZES:
-        points = clouds(*shape) if shape[1] >= 32 else clouds(1, 32)
+    for shape in ((1, 32), (4, 100), (2, 257)):
+        points = clouds(*shape)
         (generated,) = session.run(["generated"], {"points": points.numpy()})
         with torch.no_grad():
-            assert np.allclose(generated, sampler(points).points.numpy(), atol=1e-5)
+            expected = sampler(points).points
+        assert np.allclose(generated, expected.numpy(), atol=1e-5)
 
 
 def anchored(**columns):
@@ -95,7 +105,8 @@ def test_exported_anchored_program_equals_the_sampler_from_the_least_number(
     with torch.no_grad():
         for shape in ((1, least), (3, 200)):
             points = clouds(*shape)
-            assert torch.allclose(program(points), sampler(points, 5).points, atol=1e-5)
+            expected = sampler(points, 5).points
+            assert torch.allclose(program(points), expected, atol=1e-5)
     with pytest.raises(AssertionError, match=f"points.*>= {least}"):
         program(clouds(1, least - 1))
 
@@ -130,7 +141,8 @@ def test_onnx_file_of_local_columns_equals_the_sampler_and_refuses_too_few_point
         points = clouds(*shape)
         (generated,) = session.run(["generated"], {"points": points.numpy()})
         with torch.no_grad():
-            assert np.allclose(generated, sampler(points, 5).points.numpy(), atol=1e-5)
+            expected = sampler(points, 5).points
+        assert np.allclose(generated, expected.numpy(), atol=1e-5)
     with pytest.raises(Exception, match="Out of range value in index tensor"):
         session.run(["generated"], {"points": clouds(1, 95).numpy()})
 
@@ -142,7 +154,12 @@ def test_sampler_that_is_not_learned_is_not_exported(tmp_path):
 
 
 CHANNELS = PointChannels(
-    [Channel("intensity"), Channel("normal_x"), Channel("normal_y"), Channel("normal_z")]
+    [
+        Channel("intensity"),
+        Channel("normal_x"),
+        Channel("normal_y"),
+        Channel("normal_z"),
+    ]
 )
 
 
@@ -151,12 +168,15 @@ CHANNELS = PointChannels(
     [
         (MOPSNet(8, point_channels=CHANNELS, **SMALL), 7),
         (FMOPSNet(8, point_channels=CHANNELS, **SMALL), 7),
-        (SNet(8, feature_channels=(8, 8), head_channels=(8,), point_channels=CHANNELS), 3),
+        (SNet(8, point_channels=CHANNELS, **SMALL_SNET), 3),
     ],
     ids=lambda value: type(value).__name__,
 )
 def test_exported_program_takes_channels(sampler, width, tmp_path):
-    points = torch.cat([clouds(2, 50), clouds(2, 51)[:, :50], clouds(2, 52)[:, :50, :1]], 2)
+    coordinates = clouds(2, 50)
+    normals = clouds(2, 51)[:, :50]
+    intensity = clouds(2, 52)[:, :50, :1]
+    points = torch.cat([coordinates, normals, intensity], dim=2)
     points = CHANNELS.renormalised(points)
     sampler.eval()
 
@@ -165,5 +185,6 @@ def test_exported_program_takes_channels(sampler, width, tmp_path):
     program = torch.export.load(tmp_path / "net.pt2").module()
     with torch.no_grad():
         generated = program(points)
+        expected = sampler(points).points[..., :width]
         assert generated.shape == (2, 8, width)
-        assert torch.allclose(generated, sampler(points).points[..., :width], atol=1e-5)
+        assert torch.allclose(generated, expected, atol=1e-5)

@@ -28,6 +28,15 @@ def test_available_lists_own_folders_before_the_package(own):
     assert names.find_model("pointnet.modelnet40") == own / "pointnet.modelnet40.safetensors"
 
 
+def test_first_of_two_own_folders_counts(own, tmp_path, monkeypatch):
+    second = tmp_path / "second"
+    second.mkdir()
+    (second / "fmops.mine.safetensors").touch()
+    monkeypatch.setenv(names.VARIABLE, os.pathsep.join([str(own), str(second)]))
+
+    assert names.find_model("fmops.mine") == own / "fmops.mine.safetensors"
+
+
 def test_resolve_prefers_existing_path(own, tmp_path):
     assert names.resolve("fmops.mine") == own / "fmops.mine.safetensors"
     (tmp_path / "fmops.mine").mkdir()

@@ -1,3 +1,5 @@
+from typing import Any
+
 import pytest
 import torch
 
@@ -6,6 +8,7 @@ from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.zoo import model_file, names, publish, weights
 from tests.support.models import rewrite, write_run
+from tests.support.records import record
 
 
 @pytest.fixture
@@ -15,42 +18,92 @@ def run(tmp_path):
 
 
 def test_card_is_written_from_the_record(run, tmp_path):
-    card = model_file.read_card(publish.add(run, "fmops.mine", tmp_path, licence="CC0"))
-    figures = {"metric": "accuracy (%)", "m": 8, "points": 64, "values": {"generated": "50.00"}}
-    assert card["figures"] == figures
-    assert (card["licence"], card["precision"], card["name"]) == ("CC0", "float32", "fmops.mine")
+    path = publish.add(run, "fmops.mine", tmp_path, licence="CC0")
+
+    card = model_file.read_card(path)
+    assert card["figures"] == {
+        "metric": "accuracy (%)",
+        "m": 8,
+        "points": 64,
+        "values": {"generated": "50.00"},
+    }
+    assert card["licence"] == "CC0"
+    assert card["precision"] == "float32"
+    assert card["name"] == "fmops.mine"
     assert card["record"]["metrics"] == run_record.read(run).metrics
 
 
+def test_card_of_several_sizes_has_the_figures_of_the_own_one():
+    metrics = {
+        "test/m8/generated/accuracy": 0.25,
+        "test/m32/generated/accuracy": 0.5,
+        "test/m32/matched/accuracy": 0.75,
+        "test/m32/fps/accuracy": 0.125,
+        "test/m32/generated/subset_distance": 0.1,
+        "test/full/accuracy": 0.875,
+    }
+    made = record(metrics=metrics, score_name="test/m32/generated/accuracy")
+
+    figures = publish.card_figures(made)
+
+    assert figures["m"] == 32
+    assert figures["values"] == {"generated": "50.00", "matched": "75.00"}
+
+
+def test_card_of_a_task_net_has_the_figure_of_all_points():
+    config = {"learn": "task", "dataset": {"n_points": 64}}
+    metrics = {"test/full/accuracy": 0.875}
+    made = record(config, metrics=metrics, score_name="test/full/accuracy")
+
+    assert publish.card_figures(made) == {
+        "metric": "accuracy (%)",
+        "m": None,
+        "points": 64,
+        "values": {"full": "87.50"},
+    }
+
+
+def files_on_card(model):
+    """Return the files of the record on a model's card."""
+    return model_file.read_card(model)["record"]["files"]
+
+
 def test_task_net_is_found_by_hash_or_name(run, tmp_path):
+    task_net = names.available()["pointnet.modelnet40"]
+    sha256 = model_file.read_card(task_net)["sha256"]
+    reference = names.pinned("pointnet.modelnet40", sha256)
+
     for digest in ("weights_loaded", "task_weights_sha256"):
-        sha256 = model_file.read_card(names.available()["pointnet.modelnet40"])["sha256"]
         other = tmp_path / digest
         write_run(other, **{digest: sha256})
-        card = model_file.read_card(publish.add(other, f"fmops.{digest}", tmp_path))
-        reference = names.pinned("pointnet.modelnet40", sha256)
-        assert card["record"]["files"]["task_weights"] == reference
-    card = model_file.read_card(publish.add(run, "fmops.none", tmp_path))
-    assert "task_weights" not in card["record"]["files"]
-    path = publish.add(run, "fmops.given", tmp_path, task_net="pointnet.modelnet40")
-    assert model_file.read_card(path)["record"]["files"]["task_weights"] == reference
-    assert weights.of_run(path, "task_weights") == names.available()["pointnet.modelnet40"]
+        model = publish.add(other, f"fmops.{digest}", tmp_path)
+        assert files_on_card(model)["task_weights"] == reference
+
+    model = publish.add(run, "fmops.none", tmp_path)
+    assert "task_weights" not in files_on_card(model)
+
+    model = publish.add(run, "fmops.given", tmp_path, task_net="pointnet.modelnet40")
+    assert files_on_card(model)["task_weights"] == reference
+    assert weights.of_run(model, "task_weights") == task_net
 
 
 def test_half_precision_is_for_wide_layers(run, tmp_path):
     path = publish.add(run, "fmops.half", tmp_path, half=True, notes="Mine.")
-    content = weights.read(path)
+
     card = model_file.read_card(path)
-    assert (card["precision"], card["notes"]) == ("float16", f"Mine. {publish.ROUNDED}")
-    assert content["state"]["rho_local.weight"].dtype == torch.float16
-    assert content["state"]["queries.weight"].dtype == torch.float32  # 2,048 entries
-    assert load(path).rho_local.weight.dtype == torch.float32  # type: ignore[union-attr]
+    assert card["precision"] == "float16"
+    assert card["notes"] == f"Mine. {publish.ROUNDED}"
+    state = weights.read(path)["state"]
+    assert state["rho_local.weight"].dtype == torch.float16
+    assert state["queries.weight"].dtype == torch.float32  # 2,048 entries
+    sampler: Any = load(path)
+    assert sampler.rho_local.weight.dtype == torch.float32
 
 
 def test_shortened_run_is_no_model(run, tmp_path):
-    record = run_record.read(run)
-    record.partial.append("tested on 1 of 4 batches")
-    run_record.write(run, record)
+    shortened = run_record.read(run)
+    shortened.partial.append("tested on 1 of 4 batches")
+    run_record.write(run, shortened)
 
     with pytest.raises(UserError, match=r"run: tested on 1 of 4 batches\. A model is made"):
         publish.add(run, "fmops.mine", tmp_path)
@@ -88,13 +141,16 @@ def test_runs_without_weights_or_scores_are_refused(tmp_path, fields, words):
 def test_record_that_names_a_model_gives_its_weights(run, tmp_path, monkeypatch):
     monkeypatch.setenv(names.VARIABLE, str(tmp_path))
     path = publish.add(run, "fmops.mine", tmp_path, task_net="pointnet.modelnet40")
-    record = run_record.read(run)
-    reference = names.pinned("fmops.mine", model_file.read_card(path)["sha256"])
-    record.files |= {"weights": reference, "task_weights": "pointnet.modelnet40"}
-    run_record.write(run, record)
+    sha256 = model_file.read_card(path)["sha256"]
+    naming = run_record.read(run)
+    naming.files["weights"] = names.pinned("fmops.mine", sha256)
+    naming.files["task_weights"] = "pointnet.modelnet40"
+    run_record.write(run, naming)
     (run / weights.FILE).unlink()
+
     assert weights.of_run(run) == path
     assert weights.of_run(run, "task_weights") == names.available()["pointnet.modelnet40"]
+
     rewrite(path, {"queries.weight": torch.ones(16, 128)})
     with pytest.raises(UserError, match="now has other weights"):
         weights.of_run(run)

@@ -10,11 +10,15 @@ from mops_lightning import downsample
 from mops_lightning.errors import UserError
 
 CLOUD = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) * 7
-CLASSES = torch.tensor([3] * 150 + [7] * 47 + [-1] * 3)
+CLASSES = torch.tensor([3, 7, -1]).repeat_interleave(torch.tensor([150, 47, 3]))
+THREES = slice(0, 150)
+SEVENS = slice(150, 197)
 
 
 def kept_classes(rows, classes=CLASSES):
-    names, counts = torch.as_tensor(classes)[torch.as_tensor(rows)].unique(return_counts=True)
+    """Return the number of kept points by class."""
+    kept = torch.as_tensor(classes)[torch.as_tensor(rows)]
+    names, counts = kept.unique(return_counts=True)
     return dict(zip(names.tolist(), counts.tolist(), strict=True))
 
 
@@ -43,16 +47,19 @@ def test_stratify_min_takes_whole_numbers_of_numpy_and_torch(least):
 def test_stratify_samples_every_class_on_its_own():
     _, rows = downsample(CLOUD, 20, stratify=CLASSES)
 
-    _, of_three = downsample(CLOUD[:150], 15)
-    _, of_seven = downsample(CLOUD[150:197], 5)
-    assert rows.tolist() == sorted([*of_three.tolist(), *(150 + of_seven).tolist()])
+    _, of_threes = downsample(CLOUD[THREES], 15)
+    _, of_sevens = downsample(CLOUD[SEVENS], 5)
+    expected = torch.cat([of_threes, 150 + of_sevens])
+    assert rows.tolist() == sorted(expected.tolist())
 
 
 @pytest.mark.parametrize("labels", [np.uint8, np.int64, ">i4"])
 def test_stratify_takes_arrays_of_whole_numbers(labels):
+    cloud = CLOUD.numpy()
     classes = CLASSES.abs().numpy()
+    given = classes.astype(labels)
 
-    points, rows = downsample(CLOUD.numpy(), 0.1, stratify=classes.astype(labels), stratify_min=5)
+    points, rows = downsample(cloud, 0.1, stratify=given, stratify_min=5)
 
     assert isinstance(points, np.ndarray)
     assert kept_classes(rows, classes) == {1: 3, 3: 12, 7: 5}
@@ -131,4 +138,5 @@ def test_stratify_of_a_flat_batch(two_clouds):
     _, rows = downsample(clouds, 20, batch=batch, stratify=classes, stratify_min=5)
 
     first, second = two_clouds.rows
-    assert rows.tolist() == [*first, *(200 + row for row in second)]
+    second_in_batch = [200 + row for row in second]
+    assert rows.tolist() == [*first, *second_in_batch]

@@ -1,15 +1,21 @@
 """A run whose sampler starts from the task net or from another run's sampler."""
 
 import copy
-import json
 from typing import Any
 
+import pytest
 import torch
 from torch import nn
 
+from mops_lightning.errors import UserError
 from mops_lightning.nets.layers import PointFeatures, PointMLP
+from mops_lightning.records import run_record
 from mops_lightning.samplers.mops import MOPSNet
-from mops_lightning.training.recipe.warm_start import copy_pointwise_layers, copy_tensors
+from mops_lightning.training.recipe.warm_start import (
+    copy_pointwise_layers,
+    copy_tensors,
+    warm_start_sampler,
+)
 from mops_lightning.zoo import weights
 from tests.support.command_line import TINY, call
 
@@ -18,7 +24,12 @@ POINTS = torch.randn(4, 60, 3, generator=torch.Generator().manual_seed(0))
 
 
 def run(tmp_path, name, *overrides):
-    settings = [*TINY, "weights=null", "recipe.ema_span=null", f"hydra.run.dir={tmp_path / name}"]
+    settings = [
+        *TINY,
+        "weights=null",
+        "recipe.ema_span=null",
+        f"hydra.run.dir={tmp_path / name}",
+    ]
     return call([*settings, *overrides], tmp_path)
 
 
@@ -34,12 +45,12 @@ def test_sampler_of_another_size_continues_from_a_run(tmp_path):
 
     assert status == 0
     assert f"tensors are copies of {folder}." in out
-    first = weights.read(folder / "weights.safetensors")
-    second = weights.read(tmp_path / "second" / "weights.safetensors")
+    first = weights.read(folder / weights.FILE)
+    second = weights.read(tmp_path / "second" / weights.FILE)
     rows = first["state"]["queries.weight"][:5]
     torch.testing.assert_close(second["state"]["queries.weight"], rows)
-    record = json.loads((tmp_path / "second" / "result.json").read_text())
-    assert record["warm_start"]["sha256"] == first["sha256"]
+    record = run_record.read(tmp_path / "second")
+    assert record.warm_start == {"sha256": first["sha256"], "tensors": len(first["state"])}
 
     start = f"recipe.warm_start={folder / 'weights.safetensors'}"
     status, _, err = run(tmp_path, "third", "sampler=snet", start)
@@ -54,6 +65,39 @@ def test_sampler_of_another_size_continues_from_a_run(tmp_path):
     assert "recipe.warm_start: no file" in err
 
 
+@pytest.mark.parametrize(
+    ("features", "rho", "copied", "left"),
+    [
+        (8, 4, 25, "rho.0.weight"),
+        (
+            6,
+            4,
+            21,
+            "features.mlp.layers.3.weight, rho_local.weight, rho_global.weight, ...",
+        ),
+    ],
+    ids=["one", "more than three"],
+)
+def test_warm_start_names_the_tensors_that_are_not_copied(features, rho, copied, left, tmp_path):
+    file = tmp_path / weights.FILE
+    weights.save(file, MOPSNet(8, **SIZES), {"learn": "sampler"}, {})
+    target = MOPSNet(8, feature_channels=(features, features), rho_channels=(rho, features))
+
+    numbers, text = warm_start_sampler(str(file), target, nn.Linear(3, 3), POINTS)
+
+    assert numbers["tensors"] == copied
+    assert text == f"{copied} of 26 tensors are copies of {file}; not copied: {left}"
+
+
+def test_warm_start_from_a_task_net_is_refused(tmp_path):
+    weights.save(tmp_path / weights.FILE, nn.Linear(3, 3), {"learn": "task"}, {})
+
+    with pytest.raises(UserError, match=r"recipe\.warm_start: .* holds a task net"):
+        warm_start_sampler(
+            str(tmp_path / weights.FILE), MOPSNet(8, **SIZES), nn.Linear(3, 3), POINTS
+        )
+
+
 def test_copy_pointwise_layers_copies_until_shapes_differ():
     source = PointMLP([3, 8, 8, 16, 32])
     source(POINTS)  # moves the running statistics
@@ -66,9 +110,10 @@ def test_copy_pointwise_layers_copies_until_shapes_differ():
     assert copied == 3
     original = source.layers.state_dict()
     for name, value in target.mlp.layers.state_dict().items():
-        layer = int(name.split(".")[0])
-        is_copied = layer < 9  # three times linear layer, BatchNorm and ReLU
-        expected = original[name] if is_copied else before[name]
+        layer, _, _ = name.partition(".")
+        expected = before[name]
+        if int(layer) < 9:  # three times linear layer, BatchNorm and ReLU
+            expected = original[name]
         assert torch.equal(value, expected), name
     with torch.no_grad():
         next(source.parameters()).zero_()

@@ -16,7 +16,10 @@ def test_clouds_to_draw_spreads_over_the_classes():
     assert names == ["long", "round"]
     assert dataset.test.labels[chosen].tolist() == [0, 2]
     assert chosen.tolist() == [0, 2]  # the first of each class
-    assert clouds_to_draw(dataset, 1)[1] == ["long"]
+
+    _, name_of_one = clouds_to_draw(dataset, 1)
+
+    assert name_of_one == ["long"]
 
 
 def test_clouds_to_draw_of_few_classes_spreads_over_the_clouds_of_each():
@@ -32,21 +35,27 @@ def test_clouds_to_draw_of_few_classes_spreads_over_the_clouds_of_each():
 def test_clouds_to_draw_of_one_class_are_of_several_files():
     dataset = small_dataset()
     files = torch.tensor([0, 0, 0, 0, 1, 1, 1, 2, 2, 2])
-    crops = dataset.test._replace(labels=torch.zeros(10, dtype=torch.int64), sources=files)
+    labels = torch.zeros(10, dtype=torch.int64)
+    crops = dataset.test._replace(labels=labels, sources=files)
+    of_one_class = replace(dataset, class_names=("cloud",), test=crops)
 
-    chosen, names = clouds_to_draw(replace(dataset, class_names=("cloud",), test=crops), 3)
+    chosen, names = clouds_to_draw(of_one_class, 3)
 
     assert files[chosen].tolist() == [0, 1, 2]
     assert names == ["cloud 1", "cloud 2", "cloud 3"]
 
 
 def test_clouds_to_draw_of_no_cloud_is_empty():
-    assert clouds_to_draw(small_dataset(), 0)[1] == []
+    chosen, names = clouds_to_draw(small_dataset(), 0)
+
+    assert len(chosen) == 0
+    assert names == []
 
 
 def test_clouds_to_draw_leaves_out_classes_without_test_clouds():
     dataset = small_dataset()
-    test = dataset.test.take(dataset.test.labels != 0)
+    is_not_long = dataset.test.labels != 0
+    test = dataset.test.take(is_not_long)
 
     chosen, names = clouds_to_draw(replace(dataset, test=test), 3)
 

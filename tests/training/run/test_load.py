@@ -9,9 +9,10 @@ from mops_lightning.config.overrides import readable
 from mops_lightning.errors import UserError
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.records import run_record
+from mops_lightning.records.run_record import Evaluated
 from mops_lightning.training.evaluation import command_line
 from mops_lightning.training.run.run import run
-from mops_lightning.zoo import publish
+from mops_lightning.zoo import publish, weights
 from mops_lightning.zoo.load import load_net
 from tests.support.command_line import job, refused, runs
 
@@ -31,9 +32,21 @@ def evaluated(trained, tmp_path, *arguments):
 
 def test_evaluate_without_changes_repeats_metrics(trained, tmp_path):
     folder, record = trained
+
     again = evaluated(trained, tmp_path)
+
     assert again.metrics == record.metrics
-    assert again.evaluated.run == str(folder)
+    saved = weights.read(folder / weights.FILE)
+    assert again.evaluated == Evaluated(
+        run=str(folder),
+        commit=record.git["commit"],
+        max_epochs=1,
+        learn="sampler",
+        recipe=record.recipe,
+        seed=0,
+        dataset="shapes",
+        weights_sha256=saved["sha256"],
+    )
     assert again.task_weights_sha256 == record.task_weights_sha256
     assert "fit" not in again.seconds
     assert again.config["learn"] == "nothing"

@@ -13,34 +13,43 @@ from tests.support.command_line import job
 
 
 def test_sampler_trained_under_several_nets(tmp_path):
-    nets = [tmp_path / f"net{seed}" for seed in (1, 2)]
-    for seed, folder in enumerate(nets, 1):
-        job(folder, "learn=task", f"seed={seed}", "dataset.seed=0")
+    first = tmp_path / "net1"
+    second = tmp_path / "net2"
+    job(first, "learn=task", "seed=1", "dataset.seed=0")
+    job(second, "learn=task", "seed=2", "dataset.seed=0")
     alone = job(tmp_path / "alone")
-    record = job(tmp_path / "both", f"other_nets=[{nets[0]},{nets[1]}]")
+    both = f"other_nets=[{first},{second}]"
+    resumed = f"ckpt_path={tmp_path / 'both'}"
+
+    record = job(tmp_path / "both", both)
+
     assert sampler_row(record) == f"{sampler_row(alone)} 3 nets"
     assert record.metrics != alone.metrics
     assert record.metrics["test/full/accuracy"] == alone.metrics["test/full/accuracy"]
+
     # Another second net is another training.
     with pytest.raises(UserError, match=r"other settings .*other_nets\.2"):
-        job(tmp_path / "new", f"other_nets=[{nets[0]}]", f"ckpt_path={tmp_path / 'both'}")
+        job(tmp_path / "new", f"other_nets=[{first}]", resumed)
+
     # And so is one under other weights in the same file.
-    kept = (nets[1] / weights.FILE).read_bytes()
-    shutil.copyfile(nets[0] / weights.FILE, nets[1] / weights.FILE)
-    both = f"other_nets=[{nets[0]},{nets[1]}]"
+    kept = (second / weights.FILE).read_bytes()
+    shutil.copyfile(first / weights.FILE, second / weights.FILE)
     with pytest.raises(UserError, match=r"other settings \(other_nets\.2\)"):
-        job(tmp_path / "newer", both, f"ckpt_path={tmp_path / 'both'}")
-    (nets[1] / weights.FILE).write_bytes(kept)
-    assert (
-        job(tmp_path / "resumed", both, f"ckpt_path={tmp_path / 'both'}").metrics == record.metrics
-    )
-    for folder in nets:  # an evaluation needs none of them
-        (folder / "weights.safetensors").unlink()
+        job(tmp_path / "newer", both, resumed)
+
+    (second / weights.FILE).write_bytes(kept)
+    again = job(tmp_path / "resumed", both, resumed)
+
+    assert again.metrics == record.metrics
+
+    for folder in (first, second):  # an evaluation needs none of them
+        (folder / weights.FILE).unlink()
     given = [f"evaluate={tmp_path / 'both'}", "pictures=0", "logger=none"]
     chosen = [readable(argument) for argument in command_line(given)]
-    again = run(compose(chosen), tmp_path / "again", chosen)
-    assert again.metrics == record.metrics
-    assert sampler_row(again) == sampler_row(record)
+    evaluated = run(compose(chosen), tmp_path / "again", chosen)
+
+    assert evaluated.metrics == record.metrics
+    assert sampler_row(evaluated) == sampler_row(record)
 
 
 @pytest.mark.parametrize(

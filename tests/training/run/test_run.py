@@ -19,15 +19,22 @@ def plain(overrides: list[str]) -> Any:
 
 
 def test_recorded_running_then_completed(tmp_path):
+    config = plain(["seed=4"])
     before = time.perf_counter()
-    with recorded(plain(["seed=4"]), tmp_path, ["seed=4"]) as record:
-        assert run_record.read(tmp_path).status == "running"
+
+    with recorded(config, tmp_path, ["seed=4"]) as record:
+        begun = run_record.read(tmp_path)
         record.metrics["test/generated/accuracy"] = 0.5
+
+    assert begun.status == "running"
     found = run_record.read(tmp_path)
-    assert (found.status, found.error, found.seed) == ("completed", None, 4)
+    passed = time.perf_counter() - before
+    assert found.status == "completed"
+    assert found.error is None
+    assert found.seed == 4
     assert found.overrides == ["seed=4"]
     assert found.metrics == {"test/generated/accuracy": 0.5}
-    assert 0 <= found.seconds["total"] <= time.perf_counter() - before + 0.001
+    assert 0 <= found.seconds["total"] <= passed + 0.001
 
 
 @pytest.mark.parametrize(
@@ -47,11 +54,18 @@ def test_recorded_exception_is_written_and_raised(raised, status, error, tmp_pat
 
 def test_run_on_part_of_the_batches_says_so(tmp_path, capsys):
     limits = ["+trainer.limit_train_batches=1", "+trainer.limit_test_batches=1"]
+
     record = job(tmp_path / "run", "weights=null", *limits)
-    parts = ["trained on 1 of 2 batches of an epoch", "tested on 1 of 3 batches"]
-    assert record.partial == run_record.read(tmp_path / "run").partial == parts
-    assert f" s, but {' and '.join(parts)}; files in " in capsys.readouterr().out
-    record = job(tmp_path / "steps", "weights=null", "+trainer.max_steps=1", "trainer.max_epochs=3")
+
+    of_training = "trained on 1 of 2 batches of an epoch"
+    of_test = "tested on 1 of 3 batches"
+    assert record.partial == [of_training, of_test]
+    assert run_record.read(tmp_path / "run").partial == [of_training, of_test]
+    assert f" s, but {of_training} and {of_test}; files in " in capsys.readouterr().out
+
+    steps = ["+trainer.max_steps=1", "trainer.max_epochs=3"]
+    record = job(tmp_path / "steps", "weights=null", *steps)
+
     assert record.partial == ["trained for 1 of 6 steps"]
 
 
@@ -62,7 +76,10 @@ def test_completed_run_resumed_is_completed_with_the_cpu_time_of_all_parts(tmp_p
     content = torch.load(path, weights_only=True)
     content["callbacks"]["CPUTime"]["seconds"] += 1000
     AtomicCheckpointIO().save_checkpoint(content, path)
+
     again = job(tmp_path / "again", "weights=null", f"ckpt_path={path}")
-    assert (again.status, again.partial) == ("completed", [])
+
+    assert again.status == "completed"
+    assert again.partial == []
     assert again.metrics == first.metrics
     assert again.seconds["fit_cpu"] > 1000

@@ -22,6 +22,19 @@ def test_sizes_to_test_returns_ascending_sizes(sizes, m, sampler, expected):
     assert sizes_to_test(sizes, m, sampler, 1024) == expected
 
 
+def test_sizes_to_test_up_to_all_points_of_a_cloud_are_taken():
+    assert sizes_to_test([100], 100, FPSSampler(100), 100) == (100,)
+    assert sizes_to_test("auto", 64, FMOPSNet(64), 64) == (8, 16, 32, 64)
+
+
+def test_sizes_to_test_of_a_trained_sampler_may_be_below_its_largest():
+    sampler = FMOPSNet(512)
+
+    assert sizes_to_test("auto", 32, sampler, 200, training=False) == (8, 16, 32, 64, 128)
+    with pytest.raises(UserError, match="m must be at most the 200 points of a cloud, got 201"):
+        sizes_to_test("auto", 201, sampler, 200, training=False)
+
+
 @pytest.mark.parametrize(
     ("sizes", "m", "sampler", "named"),
     [

@@ -1,6 +1,7 @@
 """Arguments of Lightning's trainer do what Lightning documents, through the real command line."""
 
 import copy
+import csv
 import re
 
 import pytest
@@ -151,20 +152,24 @@ def test_plugin_is_used_and_one_that_writes_checkpoints_is_refused(tmp_path):
         job(tmp_path / "io", "weights=null", io)
 
 
-def test_log_every_n_steps_gives_one_point_for_so_many_steps(tmp_path):
-    settings = [
-        "weights=null",
-        "logger=csv",
-        "trainer.max_epochs=4",
-        "+trainer.log_every_n_steps=3",
-    ]
+@pytest.mark.parametrize(
+    ("given", "logged_steps"),
+    [
+        (["+trainer.log_every_n_steps=3"], ["2", "5"]),
+        ([], ["1", "3", "5", "7"]),  # once in an epoch of two steps
+    ],
+    ids=["given", "short epochs"],
+)
+def test_log_every_n_steps_gives_one_point_for_so_many_steps(given, logged_steps, tmp_path):
+    settings = ["weights=null", "logger=csv", "trainer.max_epochs=4"]
 
-    job(tmp_path / "run", *settings)
+    job(tmp_path / "run", *settings, *given)
 
     (path,) = (tmp_path / "run").rglob("metrics.csv")
-    header, *rows = [line.split(",") for line in path.read_text().splitlines()]
-    steps = [row[header.index("step")] for row in rows if row[header.index("train/tau")]]
-    assert steps == ["2", "5"]  # of 8
+    with path.open() as file:
+        rows = list(csv.DictReader(file))
+    steps = [row["step"] for row in rows if row["train/tau"]]
+    assert steps == logged_steps  # of 8
 
 
 def test_true_bfloat16_trains_and_tests(tmp_path):
@@ -194,6 +199,7 @@ def test_refusals_of_lightning_reach_the_user_in_one_line(argument, said, tmp_pa
 
 def test_shortened_task_net_starts_no_sampler_and_fills_no_cache(tmp_path):
     job(tmp_path / "short", "learn=task", "+trainer.limit_train_batches=1")
+
     assert not list((tmp_path / "cache").rglob(weights.FILE))
     assert shortening(run_record.read(tmp_path / "short").config) == [
         "trainer.limit_train_batches=1"
@@ -204,11 +210,21 @@ def test_shortened_task_net_starts_no_sampler_and_fills_no_cache(tmp_path):
     assert record.partial == ["used a task net trained with trainer.limit_train_batches=1"]
 
 
+def test_shortened_training_of_a_sampler_uses_the_cached_task_net(tmp_path):
+    whole = job(tmp_path / "whole", "sampler=fps")
+
+    short = job(tmp_path / "short", "+trainer.limit_train_batches=1")
+
+    assert short.partial == ["trained on 1 of 2 batches of an epoch"]
+    assert short.task_weights_sha256 == whole.task_weights_sha256
+
+
 def test_shortened_sampler_is_no_warm_start_and_no_figure_of_a_report(tmp_path):
     job(tmp_path / "short", "weights=null", "+trainer.max_steps=1")
     start = f"recipe.warm_start={tmp_path}/short/{weights.FILE}"
     with pytest.raises(UserError, match=r"short/weights.* was trained with trainer\.max_steps=1"):
         job(tmp_path / "new", "weights=null", start)
+
     arguments = ["evaluate=short", "pictures=0", "logger=none", "hydra.run.dir=again"]
 
     done(arguments, tmp_path)
