@@ -3,6 +3,7 @@
 import pytest
 
 from mops_lightning.config.check_overrides import check_overrides
+from mops_lightning.errors import UserError
 from tests.support.command_line import TINY, TINY_WITH_PICTURES, refused
 
 LATE, NET = "+trainer.val_check_interval=100", "task/net=hierarchical"
@@ -120,3 +121,27 @@ def test_current_folder_that_is_an_interpolation_ends_in_one_line(tmp_path):
 def test_check_overrides_takes_names():
     check_overrides(["out='5'", "weights=null", "ckpt_path=last,null", "sampler=fps,mops"])
     check_overrides(["baselines={}"])
+
+
+@pytest.mark.parametrize("key", ["sampler.alhpa", "sampler.alhpa.inner", "task.net.dropuot"])
+def test_check_overrides_inner_key_that_no_file_has_raises(key):
+    unknown = key.removesuffix(".inner")
+
+    with pytest.raises(UserError, match=rf"^{unknown}: no such setting\."):
+        check_overrides([f"{key}=1"])
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["+sampler.alhpa=1", "sampler.alhpa=2"],
+        ["+sampler.mine={alhpa: 1}", "sampler.mine.alhpa=2"],
+        ["sampler=mine", "sampler.alhpa=1"],
+        ["sampler._target_=my.Sampler", "sampler.alhpa=1"],
+        ["hydra.searchpath=[file:///elsewhere]", "sampler.alhpa=1"],
+        ["--config-dir", "elsewhere", "sampler.alhpa=1"],
+        ["dataset.classes.0=chair"],
+    ],
+)
+def test_check_overrides_leaves_inner_keys_that_others_may_bring_to_hydra(arguments):
+    check_overrides(arguments)
