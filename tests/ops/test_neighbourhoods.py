@@ -49,23 +49,31 @@ def plain_features(points):
         _, normal = plain_ellipsoid(centred, nearest[place, :12], place)
         normals.append(normal)
     features = []
-    for place in range(len(points)):
+    for place, point in enumerate(centred):
         numbers = []
         for k in (6, 12, 24):
-            lengths, _ = plain_ellipsoid(centred, nearest[place, :k], place)
+            near = nearest[place, :k]
+            lengths, _ = plain_ellipsoid(centred, near, place)
             lengths.append(distances[place, k - 1])
-            numbers += [np.log(length / spacing + 0.01) for length in lengths]
+            for length in lengths:
+                numbers.append(logarithm(length / spacing))
+        normal = normals[place]
         for k in (6, 12, 24):
-            cosines = [abs(normals[place] @ normals[row]) for row in nearest[place, :k]]
-            numbers.append(np.log(1 - np.mean(cosines) + 0.01))
-            numbers.append(np.log(1 - min(cosines) + 0.01))
-        lever = np.cross(centred[place], normals[place])
-        numbers.append(np.linalg.norm(centred[place]))
-        numbers.append(abs(centred[place] @ normals[place]))
-        numbers.append(np.log(np.linalg.norm(lever) + 0.01))
+            cosines = [abs(normal @ normals[row]) for row in nearest[place, :k]]
+            numbers.append(logarithm(1 - np.mean(cosines)))
+            numbers.append(logarithm(1 - min(cosines)))
+        lever = np.cross(point, normal)
+        numbers.append(np.linalg.norm(point))
+        numbers.append(abs(point @ normal))
+        numbers.append(logarithm(np.linalg.norm(lever)))
         numbers.append(np.log(spacing))
         features.append(numbers)
     return np.array(features)
+
+
+def logarithm(number):
+    """Return the logarithm of a number that may be zero."""
+    return np.log(number + 0.01)
 
 
 def test_features_equal_a_plain_form():

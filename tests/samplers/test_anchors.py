@@ -208,9 +208,11 @@ def test_columns_of_coincident_points_have_a_least_width():
     (generated,) = net(points.double()).points
 
     # Weights fall off by exp(−d²/s²) with s = 0.001.
-    share_of_other_place = math.exp(-4) / (1 + math.exp(-4))
-    expected = [0.002 * share_of_other_place, 0.002 * (1 - share_of_other_place)]
-    assert sorted(generated[:, 0].tolist()) == pytest.approx(expected, rel=1e-4)
+    weight = math.exp(-4)
+    share_of_other_place = weight / (1 + weight)
+    low = 0.002 * share_of_other_place
+    high = 0.002 - low
+    assert sorted(generated[:, 0].tolist()) == pytest.approx([low, high], rel=1e-4)
 
 
 def median_width(net, points):

@@ -1,6 +1,7 @@
 """Samplers that need no unit sphere choose as in it, in any unit, order and place."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -33,6 +34,18 @@ def test_rows_are_those_of_the_cloud_in_the_unit_sphere(method, number, randn):
     _, rows = sampler.downsample(points)
 
     expected = sampler(in_unit_sphere(points)).indices
+    assert torch.equal(rows, expected)
+
+
+@pytest.mark.parametrize("method", ["fps", "random", "poisson"])
+def test_rows_by_weight_are_those_of_the_cloud_in_the_unit_sphere(method, randn, rand):
+    points = randn(3, 50, 3) * 40 + 7
+    weight = rand(3, 50) + 0.1
+    sampler = sampler_of(method, 20, 3)
+
+    _, rows = sampler.downsample(points, weight=weight)
+
+    expected = sampler.sample_weighted(in_unit_sphere(points), 20, weight)
     assert torch.equal(rows, expected)
 
 
@@ -72,11 +85,13 @@ def test_points_of_a_map_are_chosen_alike_in_python_and_by_the_command_line(meth
 def test_arrays_tensors_and_the_sampler_give_the_same_rows(start, kind, dtype, rng):
     points = cloud_of(kind, (2, 200), dtype, rng)
     array = points.numpy()
-    _, expected = FPSSampler(50, 5, start).downsample(points)
+    sampler = FPSSampler(50, 5, start)
+    settings: dict[str, Any] = {"seed": 5, "start": start}
 
-    kept, rows = downsample(points, 50, seed=5, start=start)
-    kept_of_array, rows_of_array = downsample(array, 50, seed=5, start=start)
-    _, rows_alone = downsample(array[1], 50, seed=5, start=start)
+    _, expected = sampler.downsample(points)
+    kept, rows = downsample(points, 50, **settings)
+    kept_of_array, rows_of_array = downsample(array, 50, **settings)
+    _, rows_alone = downsample(array[1], 50, **settings)
 
     assert torch.equal(rows, expected)
     assert rows_of_array.tolist() == expected.tolist()

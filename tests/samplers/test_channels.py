@@ -18,6 +18,7 @@ from mops_lightning import (
     ProgressiveSampleNet,
     RandomSampler,
     SampleNet,
+    SampleOutput,
     Sampler,
     SerialSampler,
     SNet,
@@ -48,17 +49,20 @@ INDEX = {
     "poisson": PoissonSampler,
     "serial": SerialSampler,
 }
-LOCAL: dict[str, Any] = {"anchors": "fps", "candidates": 2, "neighbours": 3}
+
+
+def moved_net(channels: Any, **settings: Any) -> Any:
+    """Return MOPS-Net with anchors whose weights are away from their start."""
+    net = MOPSNet(M, point_channels=channels, **settings, **MOPS_LAYERS)
+    return moved(net)
 
 
 LEARNED = {
     "gumbel": lambda channels: GumbelSampler(M, feature_channels=(8, 6), point_channels=channels),
     "mops": lambda channels: MOPSNet(M, point_channels=channels, **MOPS_LAYERS),
     "fmops": lambda channels: FMOPSNet(M, point_channels=channels, **MOPS_LAYERS),
-    "anchors": lambda channels: moved(
-        MOPSNet(M, anchors="fps", point_channels=channels, **MOPS_LAYERS)
-    ),
-    "local": lambda channels: moved(MOPSNet(M, point_channels=channels, **LOCAL, **MOPS_LAYERS)),
+    "anchors": lambda channels: moved_net(channels, anchors="fps"),
+    "local": lambda channels: moved_net(channels, anchors="fps", candidates=2, neighbours=3),
     "snet": lambda channels: SNet(M, point_channels=channels, **SMALL),
     "samplenet": lambda channels: SampleNet(M, k=3, point_channels=channels, **SMALL),
     "progressive": lambda channels: ProgressiveSampleNet(M, k=3, point_channels=channels, **SMALL),
@@ -80,10 +84,10 @@ def test_index_sampler_selects_by_coordinates_and_brings_all_channels(name, clou
 
     output = sampler(clouds)
 
-    expected = sampler(clouds[..., :3].contiguous()).indices
+    coordinates = clouds[..., :3].contiguous()
+    expected = sampler(coordinates).indices
     assert torch.equal(output.indices, expected)
-    for b in range(B):
-        assert torch.equal(output.points[b], clouds[b][expected[b]])
+    assert torch.equal(output.points, gather_points(clouds, expected))
 
 
 def test_critical_points_are_chosen_by_a_net_with_channels(clouds):
@@ -107,8 +111,9 @@ def test_learned_sampler_returns_channels_with_normals_of_length_one(name, train
 
     output = sampler(clouds)
 
+    lengths = output.points[..., 4:].norm(dim=2)
     assert output.points.shape == (B, M, 7)
-    assert_close(output.points[..., 4:].norm(dim=2), torch.ones(B, M))
+    assert_close(lengths, torch.ones(B, M))
     if output.soft_projected is not None:
         assert output.soft_projected.shape == (B, M, 7)
 
@@ -165,7 +170,9 @@ def test_subset_loss_is_between_coordinates(clouds):
 
     output = sampler(clouds)
 
-    expected = subset_losses(clouds[..., :3].contiguous(), output.points[..., :3].contiguous(), [M])
+    places = clouds[..., :3].contiguous()
+    generated = output.points[..., :3].contiguous()
+    expected = subset_losses(places, generated, [M])
     assert_close(output.losses["subset"], sampler.alpha * expected[M])
 
 
@@ -175,16 +182,23 @@ def test_weights_have_the_names_of_a_sampler_without_channels(name):
     with_channels = LEARNED[name](CHANNELS).state_dict()
 
     assert list(with_channels) == list(without)
-    (wider,) = [key for key in without if without[key].shape != with_channels[key].shape]
-    assert with_channels[wider].shape[1] == without[wider].shape[1] + 4
+    wider = []
+    for key, weights in without.items():
+        if weights.shape != with_channels[key].shape:
+            wider.append(key)
+            assert with_channels[key].shape[1] == weights.shape[1] + 4
+    assert len(wider) == 1
 
 
 @pytest.mark.parametrize("name", LEARNED)
 def test_points_with_other_channels_are_refused(name, clouds):
+    without = LEARNED[name](0)
+    with_channels = LEARNED[name](CHANNELS)
+
     with pytest.raises(UserError, match=r"shape \(B, N, 3\), got \(2, 40, 7\)"):
-        LEARNED[name](0)(clouds)
+        without(clouds)
     with pytest.raises(UserError, match=r"shape \(B, N, 7\), 4 of them channels beside x, y and z"):
-        LEARNED[name](CHANNELS)(clouds[..., :3])
+        with_channels(clouds[..., :3])
 
 
 def test_own_sampler_without_channels_sees_coordinates_only(clouds):
@@ -192,7 +206,7 @@ def test_own_sampler_without_channels_sees_coordinates_only(clouds):
         def sample(self, points, m):
             assert points.shape == (B, N, 3)
             rows = torch.arange(m).expand(len(points), m)
-            return RandomSampler(m)(points)._replace(points=points[:, :m], indices=rows)
+            return SampleOutput(points[:, :m], rows, {})
 
     output = FirstPoints(M)(clouds)
 
@@ -208,9 +222,12 @@ def test_wrong_number_of_channels_raises(channels):
 def test_streamed_sample_equals_the_whole(clouds):
     sampler = LEARNED["mops"](CHANNELS).eval()
 
-    streamed = stream_sample(sampler, lambda: iter(clouds[0].split(15)))
+    chunks = clouds[0].split(15)
 
-    assert_close(streamed, sampler(clouds).points[0])
+    streamed = stream_sample(sampler, lambda: chunks)
+
+    whole, _ = sampler(clouds).points
+    assert_close(streamed, whole)
 
 
 def test_downsample_without_the_channels_names_them(clouds):
@@ -230,10 +247,15 @@ def test_downsample_of_missing_values_says_how_many(clouds):
 
 
 def test_downsample_by_an_index_sampler_keeps_all_columns(clouds):
-    points, indices = FPSSampler(M).downsample(clouds[0])
+    cloud = clouds[0]
+    coordinates = cloud[:, :3]
+    sampler = FPSSampler(M)
 
-    assert torch.equal(points, clouds[0][indices])
-    assert torch.equal(indices, FPSSampler(M).downsample(clouds[0, :, :3])[1])
+    points, rows = sampler.downsample(cloud)
+
+    _, expected = sampler.downsample(coordinates)
+    assert torch.equal(rows, expected)
+    assert torch.equal(points, cloud[rows])
 
 
 def test_point_channels_takes_a_number_of_numpy():

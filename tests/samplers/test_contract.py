@@ -6,6 +6,7 @@ from torch.testing import assert_close
 
 from mops_lightning import GumbelSampler, MOPSNet, Sampler, SNet
 from mops_lightning.errors import UserError
+from mops_lightning.ops.points import gather_points
 from tests.support.samplers import SAMPLERS
 
 SEEDED = ["random", "fps", "poisson", "normal_space"]
@@ -32,8 +33,13 @@ def clouds(randn):
 
 def lattice(rng):
     """Distinct points with coordinates k/4, so that most distances are tied."""
-    grid = torch.cartesian_prod(*[torch.arange(5) / 4] * 3)
-    return torch.stack([grid[torch.randperm(125, generator=rng)[:N]] for _ in range(B)])
+    steps = torch.arange(5) / 4
+    grid = torch.cartesian_prod(steps, steps, steps)
+    clouds = []
+    for _ in range(B):
+        order = torch.randperm(125, generator=rng)
+        clouds.append(grid[order[:N]])
+    return torch.stack(clouds)
 
 
 def as_sets(points):
@@ -70,12 +76,16 @@ def test_autocast_keeps_dtype(make, training, clouds):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_output_has_shape_dtype_and_device(make, clouds, dtype, device):
     points = clouds.to(device, dtype)
-    output = make(dtype=dtype).to(device)(points)
+    sampler = make(dtype=dtype).to(device)
+
+    output = sampler(points)
+
     assert output.points.shape == (B, M, 3)
     assert output.points.dtype == dtype
     assert output.points.device == points.device
     assert torch.isfinite(output.points).all()
-    assert all(loss.ndim == 0 for loss in output.losses.values())
+    for loss in output.losses.values():
+        assert loss.ndim == 0
     if output.indices is not None:
         assert output.indices.shape == (B, M)
         assert output.indices.dtype == torch.int64
@@ -85,22 +95,29 @@ def test_output_has_shape_dtype_and_device(make, clouds, dtype, device):
 @pytest.mark.parametrize("cloud", ["random", "lattice"])
 def test_indices_are_distinct_rows_of_input(make, clouds, cloud, rng):
     points = clouds if cloud == "random" else lattice(rng)
+
     output = make()(points)
+
     if output.indices is None:
         pytest.skip("generates its points")
-    for b in range(B):
-        assert torch.equal(output.points[b], points[b][output.indices[b]])
-        assert len(set(output.indices[b].tolist())) == M
+    assert torch.equal(output.points, gather_points(points, output.indices))
+    for rows in output.indices.tolist():
+        assert len(set(rows)) == M
 
 
 def test_several_sizes_equal_single_sizes_and_are_nested_where_declared(make, clouds):
     sampler = make()
-    if sampler.flexible:
-        whole = sampler(clouds).points
-        for m, output in sampler.sample_sizes(clouds, (M, 1, M - 3)).items():
-            assert_close(output.points, sampler(clouds, m).points)
-            if sampler.nested:
-                assert_close(output.points, whole[:, :m])
+    if not sampler.flexible:
+        return
+    whole = sampler(clouds).points
+
+    outputs = sampler.sample_sizes(clouds, (M, 1, M - 3))
+
+    for m, output in outputs.items():
+        alone = sampler(clouds, m)
+        assert_close(output.points, alone.points)
+        if sampler.nested:
+            assert_close(output.points, whole[:, :m])
 
 
 def test_sampler_without_sample_raises(clouds):
@@ -110,20 +127,28 @@ def test_sampler_without_sample_raises(clouds):
 
 def test_result_does_not_depend_on_default_device(make, clouds):
     sampler = make()
+
     with torch.device("meta"):
         output = sampler(clouds)
-    assert torch.equal(output.points, sampler(clouds).points)
+
+    expected = sampler(clouds)
+    assert torch.equal(output.points, expected.points)
 
 
 @pytest.mark.parametrize("m", [0, -1, M + 1])
 def test_size_out_of_range_raises(make, clouds, m):
+    sampler = make()
+
     with pytest.raises(UserError, match=f"m must be .*{M}.* got {m}"):
-        make()(clouds, m)
+        sampler(clouds, m)
 
 
 def test_size_above_number_of_points_raises(make, clouds):
+    sampler = make()
+    too_few = clouds[:, : M - 1]
+
     with pytest.raises(UserError, match=f"N={M - 1}, got m={M}"):
-        make()(clouds[:, : M - 1])
+        sampler(too_few)
 
 
 def test_other_size_needs_flexible_sampler(make, clouds):
@@ -133,9 +158,13 @@ def test_other_size_needs_flexible_sampler(make, clouds):
             sampler(clouds, M - 3)
         return
     for m in (1, M - 3, M):
-        assert sampler(clouds, m).points.shape == (B, m, 3)
-        assert sampler.sample(clouds, m).points.shape == (B, m, 3)
-        assert_close(sampler(clouds, m).points, make(m)(clouds).points)
+        output = sampler(clouds, m)
+        unchecked = sampler.sample(clouds, m)
+        of_this_size = make(m)(clouds)
+
+        assert output.points.shape == (B, m, 3)
+        assert unchecked.points.shape == (B, m, 3)
+        assert_close(output.points, of_this_size.points)
 
 
 @pytest.mark.parametrize(
@@ -153,20 +182,25 @@ def test_other_size_needs_flexible_sampler(make, clouds):
     ],
 )
 def test_invalid_input_raises(make, points, named):
+    sampler = make()
+
     with pytest.raises(UserError, match=f"points must .*{named}"):
-        make()(points)
+        sampler(points)
 
 
 @pytest.mark.parametrize("cloud", ["random", "lattice"])
 def test_sample_is_permutation_invariant(make, clouds, cloud, rng):
     points = clouds if cloud == "random" else lattice(rng)
     sampler = make()
-    permuted = points[:, torch.randperm(N, generator=rng)]
-    first, second = sampler(points).points, sampler(permuted).points
+    order = torch.randperm(N, generator=rng)
+
+    sampled = sampler(points).points
+    sampled_in_order = sampler(points[:, order]).points
+
     if sampler.learned:
-        assert_close(first, second, atol=1e-5, rtol=0)
+        assert_close(sampled_in_order, sampled, atol=1e-5, rtol=0)
     else:
-        assert as_sets(first) == as_sets(second)
+        assert as_sets(sampled_in_order) == as_sets(sampled)
 
 
 @pytest.mark.parametrize("cloud", ["random", "lattice"])
@@ -174,7 +208,9 @@ def test_sample_is_independent_of_batch(make, clouds, cloud, rng):
     points = clouds if cloud == "random" else lattice(rng)
     points[1, 5:9] = points[1, 4]  # copies in one cloud must not affect another
     sampler = make()
+
     together = sampler(points)
+
     for b in range(B):
         alone = sampler(points[b : b + 1])
         if sampler.learned:
@@ -186,11 +222,17 @@ def test_sample_is_independent_of_batch(make, clouds, cloud, rng):
 
 
 def test_sample_is_deterministic_without_side_effects(make, clouds):
-    before, state = clouds.clone(), torch.random.get_rng_state()
+    before = clouds.clone()
+    state = torch.random.get_rng_state()
     sampler = make()
-    first, second = sampler(clouds), sampler(clouds)
+    another = make()
+
+    first = sampler(clouds)
+    second = sampler(clouds)
+    of_another = another(clouds)
+
     assert torch.equal(first.points, second.points)
-    assert torch.equal(first.points, make()(clouds).points)
+    assert torch.equal(first.points, of_another.points)
     assert torch.equal(clouds, before)
     assert torch.equal(torch.random.get_rng_state(), state)
 
@@ -200,14 +242,18 @@ def test_seed_changes_sample(name, rng):
     clouds = lattice(rng)
 
     def sample(seed):
-        return as_sets(SAMPLERS[name](M, seed=seed)(clouds).points)
+        sampler = SAMPLERS[name](M, seed=seed)
+        return as_sets(sampler(clouds).points)
 
     assert sample(1) == sample(1)
     assert sample(1) != sample(2)
 
 
 def test_size_of_all_points_returns_all(make, clouds):
-    output = make(m=N)(clouds)
+    sampler = make(m=N)
+
+    output = sampler(clouds)
+
     assert output.points.shape == (B, N, 3)
     if output.indices is not None:
         assert as_sets(output.points) == as_sets(clouds)
@@ -218,14 +264,19 @@ def test_coincident_points_give_valid_sample(make, distinct, randn):
     place = torch.arange(N) % distinct
     points = randn(B, distinct, 3)[:, place]
     sampler = make()
+
     output = sampler(points)
+
     assert torch.isfinite(output.points).all()
     if isinstance(sampler, SNet):
         return  # its points are not restricted to the convex hull
-    assert (output.points <= points.amax(1, keepdim=True) + 1e-6).all()
-    assert (output.points >= points.amin(1, keepdim=True) - 1e-6).all()
+    largest = points.amax(1, keepdim=True)
+    smallest = points.amin(1, keepdim=True)
+    assert (output.points <= largest + 1e-6).all()
+    assert (output.points >= smallest - 1e-6).all()
     if output.indices is not None:
-        assert all(len(set(row)) == M for row in output.indices.tolist())
+        for rows in output.indices.tolist():
+            assert len(set(rows)) == M
 
 
 def test_gradients_are_correct(make, randn):
@@ -262,11 +313,14 @@ GRAPHS = ["mops", "fmops", "snet", "samplenet", "samplenet-progressive"]
 def test_compiles_to_one_graph(name, training, clouds):
     torch.compiler.reset()
     sampler = SAMPLERS[name](M).train(training)
+    compiled = torch.compile(sampler, backend="eager", fullgraph=True)
+
     with torch.no_grad():
-        want = sampler(clouds)
-        got = torch.compile(sampler, backend="eager", fullgraph=True)(clouds)
-    assert_close(got.points, want.points)
-    assert_close(got.losses, want.losses)
+        expected = sampler(clouds)
+        output = compiled(clouds)
+
+    assert_close(output.points, expected.points)
+    assert_close(output.losses, expected.losses)
 
 
 class Generated(torch.nn.Module):
@@ -283,6 +337,9 @@ def test_exported_program_generates_the_same_points(name, clouds, tmp_path):
     sampler = SAMPLERS[name](M).eval()
     path = tmp_path / "sampler.pt2"
     with torch.no_grad():
-        torch.export.save(torch.export.export(Generated(sampler), (clouds,)), path)
-        got = torch.export.load(path).module()(clouds)
-        assert_close(got, sampler(clouds).points)
+        program = torch.export.export(Generated(sampler), (clouds,))
+        torch.export.save(program, path)
+
+        loaded = torch.export.load(path).module()
+
+        assert_close(loaded(clouds), sampler(clouds).points)

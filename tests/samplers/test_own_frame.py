@@ -63,16 +63,26 @@ NORMALS = PointChannels(
 
 def test_sample_of_a_turned_cloud_with_normals_is_the_turned_sample(rng, randn):
     clouds, turned, rotations, shift = turned_pair(rng)
-    normals = torch.nn.functional.normalize(randn(3, 70, 3).double(), dim=2)
-    points = torch.cat([clouds, normals], 2)
-    turned_points = torch.cat([turned, normals @ rotations.mT], 2)
+    points, turned_points = with_normals(clouds, turned, rotations, randn)
     sampler = moved_sampler("framed", point_channels=NORMALS)
 
     sample = sampler(points).points
     sample_of_turned = sampler(turned_points).points
 
-    assert_close(sample_of_turned[..., :3], sample[..., :3] @ rotations.mT + shift)
-    assert_close(sample_of_turned[..., 3:], sample[..., 3:] @ rotations.mT)
+    expected_places = sample[..., :3] @ rotations.mT + shift
+    expected_normals = sample[..., 3:] @ rotations.mT
+    assert_close(sample_of_turned[..., :3], expected_places)
+    assert_close(sample_of_turned[..., 3:], expected_normals)
+
+
+def with_normals(clouds, turned, rotations, randn):
+    """Return clouds and turned clouds with normals that turn with them."""
+    directions = randn(clouds.shape).double()
+    normals = torch.nn.functional.normalize(directions, dim=2)
+    turned_normals = normals @ rotations.mT
+    points = torch.cat([clouds, normals], 2)
+    turned_points = torch.cat([turned, turned_normals], 2)
+    return points, turned_points
 
 
 def test_sample_of_plain_anchors_does_not_turn_with_its_cloud(rng):
@@ -119,16 +129,22 @@ def test_own_axes_take_the_widest_of_the_next_three_farthest_points():
 @pytest.mark.parametrize("radius", [1e-3, 1.0, 1e3])
 def test_own_axes_of_a_narrow_cloud_are_known_from_its_width(radius):
     """Of a hundred thousandth of the radius and less, rounding would decide."""
-    narrow = torch.tensor([[[1.0, 0, 0], [-1, 0, 0], [0, 1e-4, 0], [0, -1e-4, 0]]]) * radius
-    line = torch.tensor([[[1.0, 0, 0], [-1, 0, 0], [0, 1e-6, 0], [0, -1e-6, 0]]]) * radius
+    narrow = radius * cross_of_points(length=1.0, width=1e-4)
+    line = radius * cross_of_points(length=1.0, width=1e-6)
 
     (of_narrow,) = own_axes(narrow)
     (of_line,) = own_axes(line)
 
-    _, second, third = of_narrow.T.abs()
-    assert_close(second, torch.tensor([0.0, 1.0, 0.0]))
-    assert_close(third, torch.tensor([0.0, 0.0, 1.0]))
+    assert_close(of_narrow.abs(), torch.eye(3))
     assert (of_line[:, 1:] == 0).all()
+
+
+def cross_of_points(length, width):
+    """Return the two ends of the x axis and of the y axis around the origin."""
+    points = torch.zeros(1, 4, 3)
+    points[0, :2, 0] = torch.tensor([length, -length])
+    points[0, 2:, 1] = torch.tensor([width, -width])
+    return points
 
 
 def test_own_axes_are_rotations(randn):
@@ -160,10 +176,7 @@ def test_points_on_one_line_give_finite_coordinates(number, direction):
 
 def test_normals_turn_with_the_cloud(rng, randn):
     clouds, turned, rotations, _ = turned_pair(rng)
-    directions = randn(clouds.shape).double()
-    normals = torch.nn.functional.normalize(directions, dim=2)
-    points = torch.cat([clouds, normals], 2)
-    turned_points = torch.cat([turned, normals @ rotations.mT], 2)
+    points, turned_points = with_normals(clouds, turned, rotations, randn)
 
     described = in_own_frame(points, NORMALS)
     described_turned = in_own_frame(turned_points, NORMALS)

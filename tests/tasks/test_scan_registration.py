@@ -3,6 +3,7 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from torch.nn import functional as F
 from torch.testing import assert_close
 
 from mops_lightning.errors import UserError
@@ -51,9 +52,7 @@ def test_starts_are_within_their_limits(clouds):
 
     batch = batch_of(many, angle=15, shift=0.1)
 
-    start = Motion(batch.quaternion, batch.translation)
-    still = identity_motion(many)
-    angles = RotationError.of(start, still)
+    angles = angles_of(batch)
     shifts = torch.linalg.vector_norm(batch.translation, dim=1)
     assert 14 < angles.max() <= 15
     assert 0.09 < shifts.max() <= 0.1
@@ -112,10 +111,11 @@ def turned_about_random_axes(directions, sizes, angle, shift):
     """Return motions from six numbers for directions and two shares of the largest sizes."""
     motions = []
     for numbers, (share_of_angle, share_of_shift) in zip(directions, sizes, strict=True):
-        axis = numbers[:3] / numbers[:3].norm()
-        along = numbers[3:] / numbers[3:].norm()
-        turn = Rotation.from_rotvec(axis.numpy() * float(share_of_angle) * np.radians(angle))
-        motions.append((turn, along.numpy() * float(share_of_shift) * shift))
+        axis = F.normalize(numbers[:3], dim=0)
+        along = F.normalize(numbers[3:], dim=0)
+        radians = share_of_angle * np.radians(angle)
+        turn = Rotation.from_rotvec(radians * axis)
+        motions.append((turn, share_of_shift * shift * along))
     return motions
 
 
@@ -136,7 +136,7 @@ def test_residuals_of_both_halves_follow_motions_that_grow_to_those_of_a_start(c
         sizes = share * torch.rand(6, 2)
         motions = turned_about_random_axes(torch.randn(6, 6), sizes, angle=40.0, shift=0.3)
         for row, (turn, shift) in enumerate(motions):
-            moved = turn.apply(halves[row].numpy()) + shift
+            moved = turn.apply(halves[row]) + shift.numpy()
             expected = plain_residuals(halves[row], others[row], moved, most=0.2)
             found = residuals[row, number].double()
             is_same = (found - expected).abs() < 1e-5
@@ -163,18 +163,22 @@ def test_halves_of_an_odd_number_of_points_leave_one_out(clouds):
 
 
 def test_starts_turn_and_shift_by_sizes_of_their_own(clouds):
-    still = identity_motion(clouds)
-
     turned = batch_of(clouds, angle=15, shift=0)
     shifted = batch_of(clouds, angle=0, shift=0.1)
     both = batch_of(clouds, angle=15, shift=0.15)
 
-    angles = RotationError.of(Motion(both.quaternion, both.translation), still)
     shifts = both.translation.norm(dim=1)
     assert (turned.translation == 0).all()
-    assert RotationError.of(Motion(shifted.quaternion, shifted.translation), still).max() == 0
+    assert (angles_of(shifted) == 0).all()
     # With one number for both, their quotients would be equal.
-    assert not torch.allclose(angles / 15, shifts / 0.15, atol=0.01)
+    assert not torch.allclose(angles_of(both) / 15, shifts / 0.15, atol=0.01)
+
+
+def angles_of(batch):
+    """Return the angles of the starts, in degrees."""
+    start = Motion(batch.quaternion, batch.translation)
+    still = identity_motion(batch.points[: len(batch.quaternion)])
+    return RotationError.of(start, still)
 
 
 def test_loss_is_smallest_at_the_mean_residual(clouds):

@@ -61,7 +61,8 @@ def test_cloud_grid_names_clouds_and_readouts(rand):
     texts = set()
     for axes in figure.axes:
         texts.add(axes.get_title())
-        texts.update(text.get_text() for text in axes.texts)
+        for text in axes.texts:
+            texts.add(text.get_text())
     assert {"chair", "vase", "input", "matched"} <= texts
 
 
@@ -97,8 +98,10 @@ def test_cloud_grid_draws_samples_over_dense_cloud(tmp_path, randn):
     over_dense = figures.cloud_grid(points[None], readouts, [""])
     alone = figures.cloud_grid(far[None], readouts, [""])
 
-    marked_over_dense = marked(pixels(over_dense, tmp_path), "matched")
-    marked_alone = marked(pixels(alone, tmp_path), "matched")
+    image_over_dense = pixels(over_dense, tmp_path)
+    image_alone = pixels(alone, tmp_path)
+    marked_over_dense = marked(image_over_dense, "matched")
+    marked_alone = marked(image_alone, "matched")
     # Without the hiding cloud the frame is tighter, hence markers cover more pixels.
     assert marked_over_dense > 0.2 * marked_alone
 
@@ -170,7 +173,7 @@ def test_load_clouds_damaged_file_is_refused(tmp_path, rand, damage):
     path = tmp_path / "clouds.npz"
     points = rand(2, 50, 3)
     figures.save_clouds(path, points, {"generated": points[:, :4]}, ["a", "b"])
-    arrays = {**np.load(path), **DAMAGES[damage]}
+    arrays = dict(np.load(path)) | DAMAGES[damage]
     if damage == "no samples":
         del arrays["generated"]
     np.savez(path, **arrays)
@@ -233,7 +236,9 @@ def test_view_upright_draws_the_upper_end_above_and_no_mirror_image(up):
     sideways, upwards = above - origin
     assert upwards > 10 * abs(sideways)
     # Turned about the vertical, the other two keep their order: seen from above, anticlockwise.
-    ground = np.stack([front - origin, right - origin])
+    to_front = front - origin
+    to_right = right - origin
+    ground = np.stack([to_front, to_right])
     assert np.linalg.det(ground) > 0
 
 
