@@ -55,41 +55,55 @@ def test_fuzzed_file_is_read_or_refused(kind, made, tmp_path, monkeypatch):
         except UserError as error:
             said = f"ended: {error}"
         shutil.rmtree(path.parent)
-        counts[said if len(said) < 10 else "bad"] += 1
-        if len(said) >= 10:
-            bad.append(f"{kind}, file {number}: {said}")
-            keep(f"{kind}-{number}{suffix}".replace(" ", "_"), content, said)
+        is_word = len(said) < 10  # "read" or "refused"
+        if is_word:
+            counts[said] += 1
+            continue
+        counts["bad"] += 1
+        bad.append(f"{kind}, file {number}: {said}")
+        name = f"{kind}-{number}{suffix}".replace(" ", "_")
+        keep(name, content, said)
     print(f"{kind}: {dict(counts)}")
-    assert not bad, f"{len(bad)} of {FILES} files:\n" + "\n".join(bad[:3])
+    first = "\n".join(bad[:3])
+    assert not bad, f"{len(bad)} of {FILES} files:\n{first}"
 
 
 def fuzzed(kind, made, number):
     random = mutations.generator(kind, number)
+    _, files = made[kind.removesuffix(" content")]
     if kind == "weights content":
-        packed = made["weights"][1][0]
-        end = 8 + int.from_bytes(packed[:8], "little")
-        header = json.loads(packed[8:end])
-        if random.random() < 0.5:
-            header = changed_content(random, header)
-        else:
-            plain = changed_content(random, json.loads(header["__metadata__"][model_file.KEY]))
-            header["__metadata__"][model_file.KEY] = json_bytes(plain).decode()
-        content = json_bytes(header)
-        return len(content).to_bytes(8, "little") + content + packed[end:]
-    if kind == "glb content":
-        scenes = made["glb"][1]
-        return changed_glb(random, scenes[random.integers(len(scenes))])
-    if kind == "copc content":
-        files = made["copc"][1]
-        return changed_copc(random, files[random.integers(len(files))])
+        return changed_weights(random, files[0])
     if kind == "record content":
-        return json_bytes(changed_content(random, json.loads(made["record"][1][0])))
-    others = made[kind][1]
-    return mutations.mutated(random, others[random.integers(len(others))], others)
+        record = json.loads(files[0])
+        return json_bytes(changed_content(random, record))
+    file = files[random.integers(len(files))]
+    if kind == "glb content":
+        return changed_glb(random, file)
+    if kind == "copc content":
+        return changed_copc(random, file)
+    return mutations.mutated(random, file, files)
+
+
+def changed_weights(random, packed):
+    """Change the header of a weights file: its tensors, or what it says of the model."""
+    end = 8 + int.from_bytes(packed[:8], "little")
+    header = json.loads(packed[8:end])
+    if random.random() < 0.5:
+        header = changed_content(random, header)
+    else:
+        metadata = header["__metadata__"]
+        plain = json.loads(metadata[model_file.KEY])
+        changed = json_bytes(changed_content(random, plain))
+        metadata[model_file.KEY] = changed.decode()
+    content = json_bytes(header)
+    length = len(content).to_bytes(8, "little")
+    return length + content + packed[end:]
 
 
 def keep(name, content, said):
-    if folder := os.environ.get("MOPS_FUZZ_KEEP"):
-        Path(folder).mkdir(parents=True, exist_ok=True)
-        (Path(folder) / name).write_bytes(content)
-        (Path(folder) / f"{name}.said").write_text(said)
+    named = os.environ.get("MOPS_FUZZ_KEEP")
+    if named:
+        folder = Path(named)
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content)
+        (folder / f"{name}.said").write_text(said)

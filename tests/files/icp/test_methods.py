@@ -6,12 +6,16 @@ import numpy as np
 
 from mops_lightning.files.icp.methods import VoxelFilter
 
+SCAN = Path("scan.ply")
+
 
 def test_voxels_of_small_gicp_keep_as_many_points_as_are_asked_for_where_they_can():
-    corners = np.stack(np.meshgrid(*[[0.0, 1.0]] * 3), -1).reshape(-1, 3)
+    corners = np.indices((2, 2, 2), float).reshape(3, 8).T
+    voxels = VoxelFilter()
 
-    eight = VoxelFilter().sample(corners, 8, 0, Path("scan.ply")).points
-    seven = VoxelFilter().sample(corners, 7, 0, Path("scan.ply")).points
+    eight = voxels.sample(corners, 8, 0, SCAN).points
+    seven = voxels.sample(corners, 7, 0, SCAN).points
 
-    assert sorted(eight.round(6).tolist()) == sorted(corners.tolist())
+    rounded = eight.round(6).tolist()
+    assert sorted(rounded) == sorted(corners.tolist())
     assert 1 <= len(seven) <= 7

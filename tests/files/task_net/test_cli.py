@@ -39,7 +39,8 @@ def missing(output, batch):
 def compared(*arguments):
     """What the command prints, and its table."""
     out = done(compare, arguments)
-    folder = arguments[arguments.index("--out") + 1]
+    place = arguments.index("--out")
+    folder = arguments[place + 1]
     return out, pd.read_csv(folder / "table.csv")
 
 
@@ -135,6 +136,16 @@ def test_net_of_ones_own_is_compared_by_its_loss(scans, tmp_path, monkeypatch):
     assert "loss of Net: 1 draw of 12 clouds from 6 files" in out
 
 
+KINDS = {
+    "trained": "FMOPSNet",
+    "fps": "FPSSampler",
+    "fps_farthest": "FPSSampler",
+    "random": "RandomSampler",
+    "poisson": "PoissonSampler",
+}
+"""Classes of the samplers that a comparison can choose."""
+
+
 def test_saved_sampler_chooses_the_best_method_of_every_number(own_scans, scans, tmp_path):
     name = tmp_path / "best"
 
@@ -147,32 +158,28 @@ def test_saved_sampler_chooses_the_best_method_of_every_number(own_scans, scans,
     assert isinstance(best, ByBudget)
     lines = re.findall(r"^- (\d+) points: (\w+)", out, re.MULTILINE)
     assert [int(m) for m, _ in lines] == [4, 8, 16, 32]
+    checking = frame[frame.files == "checking"]
     for m, method in lines:
         chosen = best.sampler_for(int(m))
-        kinds = {
-            "trained": "FMOPSNet",
-            "fps": "FPSSampler",
-            "fps_farthest": "FPSSampler",
-            "random": "RandomSampler",
-            "poisson": "PoissonSampler",
-        }
-        assert type(chosen).__name__ == kinds[method]
-        rank = frame[(frame.m == int(m)) & (frame.files == "checking")]
-        means = rank.groupby("method").score.mean()
+        assert type(chosen).__name__ == KINDS[method]
+        of_size = checking[checking.m == int(m)]
+        means = of_size.groupby("method").score.mean()
+        best_of_fps = min(means["fps"], means["fps_farthest"])
         if method not in ("fps", "fps_farthest"):
-            assert means[method] < min(means["fps"], means["fps_farthest"])
+            assert means[method] < best_of_fps
 
-    done(downsample, [scans / "0.ply", tmp_path / "few.npy", "--weights", name, "--m", 40])
-    done(downsample, [scans / "0.ply", tmp_path / "tile.npy", "--weights", name, "--m", 50,
-                      "--tile", 64])  # fmt: skip
-    assert np.load(tmp_path / "few.npy").shape == (40, 3)  # above the compared numbers: FPS
-    assert len(np.unique(np.load(tmp_path / "tile.npy"), axis=0)) == 50
+    few = tmp_path / "few.npy"
+    tiled = tmp_path / "tile.npy"
+    done(downsample, [scans / "0.ply", few, "--weights", name, "--m", 40])
+    done(downsample, [scans / "0.ply", tiled, "--weights", name, "--m", 50, "--tile", 64])
+    assert np.load(few).shape == (40, 3)  # above the compared numbers: FPS
+    different = np.unique(np.load(tiled), axis=0)
+    assert len(different) == 50
     points = torch.rand(1, 64, 3)
-    above = best.downsample(points, 40)[1]
-    assert any(
-        torch.equal(above, FPSSampler(40, start=start).downsample(points, 40)[1])
-        for start in (None, "farthest")
-    )
+    _, above = best.downsample(points, 40)
+    _, by_fps = FPSSampler(40).downsample(points, 40)
+    _, by_farthest = FPSSampler(40, start="farthest").downsample(points, 40)
+    assert torch.equal(above, by_fps) or torch.equal(above, by_farthest)
 
 
 def test_files_of_the_training_are_left_out(own_scans, tmp_path):
@@ -219,10 +226,12 @@ def test_two_comparisons_of_a_seed_agree_exactly(own_scans, scans, tmp_path):
     ],
 )
 def test_mistake_ends_in_one_line(arguments, said, own_scans, scans, tmp_path):
-    given = [scans, "--task-net", own_scans, *arguments, "--out", tmp_path / "out"]
+    out = tmp_path / "out"
 
-    assert re.search(said, refused(compare, given))
-    assert not (tmp_path / "out").exists()
+    line = refused(compare, [scans, "--task-net", own_scans, *arguments, "--out", out])
+
+    assert re.search(said, line)
+    assert not out.exists()
 
 
 def test_files_without_what_the_net_needs_are_refused(classifier, segmenter, scans, tmp_path):
@@ -241,21 +250,23 @@ def test_files_without_what_the_net_needs_are_refused(classifier, segmenter, sca
 
 
 def test_part_that_the_net_does_not_know_is_refused(segmenter, scans, tmp_path):
-
+    path = tmp_path / "a.ply"
     points = uniform_points(100, 0)
-    write_cloud(tmp_path / "a.ply", points, {"part": np.full(100, 7, np.int32)})
+    part = np.full(100, 7, np.int32)
+    write_cloud(path, points, {"part": part})
 
-    err = refused(compare, [tmp_path / "a.ply", "--task-net", segmenter, "--m", 8])
+    err = refused(compare, [path, "--task-net", segmenter, "--m", 8])
 
     assert re.search(r"100 points have a part that .* does not know, such as 7; it knows 0, 1", err)
 
 
 def test_options_of_a_task_net_need_one(scans, tmp_path):
-    for option in (["--save", "x"], ["--label", "x"], ["--loss", "x.y"]):
-        err = refused(compare, [scans / "0.ply", "--m", 8, *option])
-        assert f"{option[0]} is for --task-net" in err
-    several = ["--weights", "a", "--weights", "b"]
-    assert "several --weights" in refused(compare, [scans / "0.ply", "--m", 8, *several])
+    command = [scans / "0.ply", "--m", 8]
+    for name, value in (("--save", "x"), ("--label", "x"), ("--loss", "x.y")):
+        err = refused(compare, [*command, name, value])
+        assert f"{name} is for --task-net" in err
+    several = refused(compare, [*command, "--weights", "a", "--weights", "b"])
+    assert "several --weights" in several
 
 
 def test_net_of_ones_own_with_a_mistake_is_refused(scans, tmp_path, monkeypatch):
@@ -279,16 +290,19 @@ def test_net_of_ones_own_with_a_mistake_is_refused(scans, tmp_path, monkeypatch)
 
 
 def test_net_of_ones_own_without_a_loss_is_told_of_it(scans, tmp_path):
-    given = [scans, "--task-net", "my_net.build", "--m", 8, "--out", tmp_path / "out"]
+    settings = ["--m", 8, "--out", tmp_path / "out"]
 
-    assert "A net of your own needs --loss, too." in refused(compare, given)
+    line = refused(compare, [scans, "--task-net", "my_net.build", *settings])
+
+    assert "A net of your own needs --loss, too." in line
 
 
 def test_saved_sampler_is_not_replaced_without_overwrite(own_scans, scans, tmp_path):
-    (tmp_path / "best.safetensors").write_text("mine")
-    given = [scans, "--task-net", own_scans, "--m", 8, "--save", tmp_path / "best"]
+    file = tmp_path / "best.safetensors"
+    file.write_text("mine")
+    settings = ["--m", 8, "--save", tmp_path / "best", "--out", tmp_path / "out"]
 
-    err = refused(compare, [*given, "--out", tmp_path / "out"])
+    err = refused(compare, [scans, "--task-net", own_scans, *settings])
 
     assert re.search(r"--save: .*best.safetensors exists", err)
-    assert (tmp_path / "best.safetensors").read_text() == "mine"
+    assert file.read_text() == "mine"

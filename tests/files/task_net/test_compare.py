@@ -21,7 +21,8 @@ class Extent(nn.Module):
 
 
 def distance(output, batch):
-    return (output - batch.points.amax(1)).norm(dim=1)
+    missing = output - batch.points.amax(1)
+    return missing.norm(dim=1)
 
 
 SMALL: dict[str, Any] = {"points": 64, "crops": 2, "draws": 3, "methods": ["random"]}
@@ -39,14 +40,15 @@ def test_scores_of_a_module_are_the_mean_losses_of_the_chosen_points(scans):
 
     whole = result.frame[result.frame.files == "all"]
     assert set(whole.method) == {"all points", "fps", "fps_farthest", "random"}
-    farthest = whole[(whole.method == "fps_farthest") & (whole.draw == 0)].score.item()
+    first_draw = whole[whole.draw == 0]
+    farthest = first_draw[first_draw.method == "fps_farthest"].score.item()
     # Two halves of three files in every draw; in each, all points come first.
-    clouds = [points for points, _, loss in chosen if not loss.any()][:2]
+    clouds = [points for points, _, loss in chosen if not loss.any()]
     expected = []
-    for points in clouds:
-        rows = FPSSampler(8, start="farthest")(points).indices
-        few = points.gather(1, rows[..., None].expand(-1, -1, 3))
-        expected += (few.amax(1) - points.amax(1)).norm(dim=1).tolist()
+    for points in clouds[:2]:
+        few = FPSSampler(8, start="farthest")(points).points
+        missing = few.amax(1) - points.amax(1)
+        expected += missing.norm(dim=1).tolist()
     assert len(expected) == 12
     assert farthest == pytest.approx(np.mean(expected), rel=1e-6)
     assert result.sentence.startswith("Use FPS")
@@ -59,7 +61,8 @@ def test_methods_with_the_same_mean_are_all_bold(scans):
 
     result = compare_task_net(scans, Extent(), [8], loss=constant, **SMALL)
 
-    rows = [line for line in result.text.splitlines() if line.startswith("| ")][1:]
+    lines = result.text.splitlines()
+    _, *rows = [line for line in lines if line.startswith("| ")]
     assert rows == [
         "| fps | **2.000** ± 0.000 |",
         "| random | **2.000** ± 0.000 |",
@@ -70,16 +73,19 @@ def test_methods_with_the_same_mean_are_all_bold(scans):
 
 def test_samplers_in_memory_are_compared_and_not_saved(scans, tmp_path):
     samplers = [FMOPSNet(16), FMOPSNet(8)]
+    best = tmp_path / "best"
+    settings: dict[str, Any] = {"loss": distance, "weights": samplers, "save": best}
 
-    result = compare_task_net(
-        scans, Extent(), [8, 16], loss=distance, weights=samplers, save=tmp_path / "best", **SMALL
-    )
+    result = compare_task_net(scans, Extent(), [8, 16], **settings, **SMALL)
 
+    frame = result.frame
+    of_second = frame[frame.method == "FMOPSNet_2"]
     assert result.own == ["FMOPSNet_1", "FMOPSNet_2"]
-    sizes = result.frame[result.frame.method == "FMOPSNet_2"].m.unique().tolist()
-    assert sizes == [8]
-    assert not any(parameter.requires_grad for parameter in load(tmp_path / "best").parameters())
-    assert {choice.method for choice in result.choices} <= {"fps", "fps_farthest", "random"}
+    assert of_second.m.unique().tolist() == [8]
+    saved = load(best)
+    assert not any(parameter.requires_grad for parameter in saved.parameters())
+    chosen = {choice.method for choice in result.choices}
+    assert chosen <= {"fps", "fps_farthest", "random"}
 
 
 def test_sampler_that_sees_other_channels_is_refused(scans, tmp_path):
@@ -87,7 +93,8 @@ def test_sampler_that_sees_other_channels_is_refused(scans, tmp_path):
     node = {"_target_": "mops_lightning.samplers.fmops.FMOPSNet", "m_max": 16}
     path = tmp_path / "a.safetensors"
     config = {"learn": "sampler", "sampler": node}
-    weights.save(path, FMOPSNet(16, point_channels=channels), config, {}, channels=channels)
+    sampler = FMOPSNet(16, point_channels=channels)
+    weights.save(path, sampler, config, {}, channels=channels)
 
     with pytest.raises(UserError, match="sees the channels intensity, but the task net sees none"):
         compare_task_net(scans, Extent(), [8], loss=distance, weights=path, **SMALL)

@@ -18,24 +18,34 @@ def files(tmp_path):
 
 
 def dataset(files, **settings):
-    return {"dataset": {"root": str(files[0].parent), "test_share": 0.3, **settings}}
+    folder = files[0].parent
+    node = {"root": str(folder), "test_share": 0.3}
+    return {"dataset": {**node, **settings}}
+
+
+def names_of(files):
+    return [file.name for file in files]
 
 
 @pytest.mark.parametrize("seed", [0, 1, 5])
 def test_kept_files_are_the_test_files_of_the_runs_own_seed(seed, files, capsys):
-    kept = without_training_files(files, [dataset(files, seed=seed)])
+    run = dataset(files, seed=seed)
 
-    split = split_by_share([PurePosixPath(name) for name in NAMES], 0.3, seed)
-    assert [file.name for file in kept] == [
-        str(file.name) for file in split if file.split == "test"
-    ]
+    kept = without_training_files(files, [run])
+
+    paths = [PurePosixPath(name) for name in NAMES]
+    split = split_by_share(paths, 0.3, seed)
+    expected = [str(file.name) for file in split if file.split == "test"]
+    assert names_of(kept) == expected
     assert "7 of 10 files left out" in capsys.readouterr().err
 
 
 def test_kept_files_of_frames_are_those_after_the_training_and_its_gap_too(files):
-    kept = without_training_files(files, [dataset(files, test_frames="last", gap=2, seed=3)])
+    run = dataset(files, test_frames="last", gap=2, seed=3)
 
-    assert [file.name for file in kept] == NAMES[5:]
+    kept = without_training_files(files, [run])
+
+    assert names_of(kept) == NAMES[5:]
 
 
 def test_files_that_any_run_was_trained_on_are_left_out(files):

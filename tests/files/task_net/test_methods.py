@@ -17,33 +17,39 @@ def test_saved_method_chooses_the_points_that_were_scored(name, tmp_path, rng):
     points = torch.rand(2, 100, 3, generator=rng)
     clouds = normalize_unit_sphere(points)
     scored = Untrained(name)
+    methods = [Untrained("fps"), scored]
     choices = [
         keep.Choice(16, name),
         keep.Choice(32, "fps"),
     ]
 
-    keep.save(tmp_path / "best.safetensors", choices, [Untrained("fps"), scored], seed=3)
+    keep.save(tmp_path / "best.safetensors", choices, methods, seed=3)
     sampler = load(tmp_path / "best")
 
     output = sampler(clouds, 16)
-    assert torch.equal(output.indices, scored.rows(clouds, 16, seed=3))
+    expected = scored.rows(clouds, 16, seed=3)
+    assert torch.equal(output.indices, expected)
 
 
 ACCURACY = MetricInfo("accuracy", unit="%", scale=100.0, higher_is_better=True)
 
 
 def test_method_that_is_better_on_the_first_half_alone_is_rejected():
+    scores = [
+        # m, method, on the half for choosing, on the other half
+        (16, "fps", 0.5, 0.5),
+        (16, "random", 0.9, 0.4),
+        (16, "voxel", 0.4, 0.4),
+        (32, "fps", 0.5, 0.5),
+        (32, "poisson", 0.9, 0.9),
+        (32, "voxel", 0.4, 0.4),
+    ]
     rows = []
-    better_on = {"random": ("choosing",), "voxel": (), "poisson": ("choosing", "checking")}
-    for m, names in ((16, ("fps", "random", "voxel")), (32, ("fps", "poisson", "voxel"))):
-        for files in ("choosing", "checking"):
-            for draw in (0, 1):
-                for name in names:
-                    is_better = files in better_on.get(name, ())
-                    score = 0.5 if name == "fps" else 0.4
-                    if is_better:
-                        score = 0.9
-                    rows.append((draw, files, m, name, score + 0.001 * draw))
+    for draw in (0, 1):
+        more = 0.001 * draw
+        for m, name, choosing, checking in scores:
+            rows.append((draw, "choosing", m, name, choosing + more))
+            rows.append((draw, "checking", m, name, checking + more))
     frame = pd.DataFrame(rows, columns=["draw", "files", "m", "method", "score"])
     methods = [Untrained(name) for name in ("fps", "random", "voxel", "poisson")]
 
