@@ -32,8 +32,9 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 
 # Children of a server that runs no threads and has imported all: a fork of the process of the tests
 # would inherit locks that threads of earlier tests held, and could wait for them for ever.
-PROCESSES: Any = multiprocessing.get_context("forkserver" if hasattr(os, "fork") else "spawn")
+PROCESSES: Any = multiprocessing.get_context("spawn")
 if hasattr(os, "fork"):
+    PROCESSES = multiprocessing.get_context("forkserver")
     PROCESSES.set_forkserver_preload(["mops_lightning.cli.sweep", __name__])
 
 TWO_EPOCHS = [*TINY, "trainer.max_epochs=2", "epochs.task=2", "baselines={}"]
@@ -41,17 +42,20 @@ TWO_EPOCHS = [*TINY, "trainer.max_epochs=2", "epochs.task=2", "baselines={}"]
 
 def single(folder):
     """One run without a pretrained net, resumed where there is a checkpoint."""
-    overrides = [*TWO_EPOCHS, "weights=null", f"out={folder}/out", f"cache={folder}/cache"]
-    if any(folder.glob("out/*/checkpoints/last.ckpt")):
+    out = folder / "out"
+    overrides = [*TWO_EPOCHS, "weights=null", f"out={out}", f"cache={folder}/cache"]
+    if any(out.glob("*/checkpoints/last.ckpt")):
         overrides.append("ckpt_path=last")
-    number = len(list(folder.glob("out/*")))
-    run(compose(overrides), folder / "out" / str(number), overrides)
+    earlier_runs = list(out.glob("*"))
+    cfg = compose(overrides)
+    run(cfg, out / str(len(earlier_runs)), overrides)
 
 
 def cell(folder):
     """One cell of a sweep, which pretrains its task net."""
     overrides = [*TWO_EPOCHS, f"cache={folder}/cache"]
-    run_cell(compose(overrides), folder / "cell", overrides)
+    cfg = compose(overrides)
+    run_cell(cfg, folder / "cell", overrides)
 
 
 WORK = {"single": single, "cell": cell}
@@ -63,9 +67,13 @@ def results(folder):
     for path in sorted(folder.rglob("weights.safetensors")):
         if ASIDE not in path.parts:
             content = weights.read(path)
-            found[content["config"]["learn"]] = (content["sha256"], content["metrics"])
-    records = [run_record.read(path.parent) for path in folder.rglob(run_record.FILE)]
-    assert any(record.status == "completed" for record in records)
+            learned = content["config"]["learn"]
+            found[learned] = (content["sha256"], content["metrics"])
+    statuses = set()
+    for path in folder.rglob(run_record.FILE):
+        record = run_record.read(path.parent)
+        statuses.add(record.status)
+    assert "completed" in statuses
     return found
 
 
@@ -86,12 +94,18 @@ def attempt(folder, work, at_write=0, after=None):
     child.kill()
     child.join()
     assert not hangs, f"{work} did not end within {MOST_SECONDS} s"
-    return child.exitcode, counts.get() if child.exitcode == 0 else 0
+    writes = 0
+    if child.exitcode == 0:
+        writes = counts.get()
+    return child.exitcode, writes
 
 
 def in_child(folder, work, at_write, counts):
     """Work, and send the number of writes."""
-    os.environ["TMPDIR"] = "/dev/shm" if Path("/dev/shm").is_dir() else str(folder)
+    temporary = Path("/dev/shm")
+    if not temporary.is_dir():
+        temporary = folder
+    os.environ["TMPDIR"] = str(temporary)
     writes = count_writes(folder, at_write)
     with contextlib.redirect_stdout(io.StringIO()):
         WORK[work](folder)
@@ -101,13 +115,18 @@ def in_child(folder, work, at_write, counts):
 def count_writes(folder, kill_at):
     """Note each change of a file below a folder; kill this process before a given one."""
     writes: list[str] = []
+    to_write = os.O_WRONLY | os.O_RDWR
 
     def hook(event, arguments):
         if event == "open":
-            changes = isinstance(arguments[2], int) and arguments[2] & (os.O_WRONLY | os.O_RDWR)
+            flags = arguments[2]
+            changes = isinstance(flags, int) and flags & to_write
         else:
             changes = event in ("os.rename", "os.mkdir", "os.remove", "os.chmod", "os.truncate")
-        if changes and str(arguments[0]).startswith(str(folder)):
+        if not changes:
+            return
+        is_below = str(arguments[0]).startswith(str(folder))
+        if is_below:
             writes.append(event)
             if len(writes) == kill_at:
                 os.kill(os.getpid(), signal.SIGKILL)
@@ -127,8 +146,9 @@ def unbroken(tmp_path_factory):
             folder.mkdir()
             start = time.monotonic()
             status, writes = attempt(folder, work)
+            seconds = time.monotonic() - start
             assert status == 0
-            found[work] = results(folder), writes, time.monotonic() - start
+            found[work] = (results(folder), writes, seconds)
         return found[work]
 
     return of
@@ -139,11 +159,13 @@ def check(folder, work, want, **kill):
     status, _ = attempt(folder, work, **kill)
     assert status in (0, -signal.SIGKILL)
     if status:
-        assert attempt(folder, work)[0] == 0
+        status_of_second, _ = attempt(folder, work)
+        assert status_of_second == 0
     assert results(folder) == want, kill
     # A single run that was killed has a folder of its own, which no later run uses.
-    left = [path for path in folder.rglob(f"{TEMPORARY}*") if work != "single"]
-    assert left == [], kill
+    if work != "single":
+        left = list(folder.rglob(f"{TEMPORARY}*"))
+        assert left == [], kill
 
 
 @pytest.mark.parametrize("work", WORK)
@@ -151,9 +173,12 @@ def test_kill_at_write_same_command_gives_same_bits(unbroken, tmp_path, work):
     want, writes, _ = unbroken(work)
     assert want
     assert writes > 4
-    numbers = range(1, writes + 1) if LONG else (2 * writes // 3,)
+    numbers = [2 * writes // 3]
+    if LONG:
+        numbers = list(range(1, writes + 1))
     for number in numbers:
-        check(tmp_path / str(number), work, want, at_write=number)
+        folder = tmp_path / str(number)
+        check(folder, work, want, at_write=number)
 
 
 @pytest.mark.skipif(not LONG, reason="the long round: make fuzz")
@@ -161,5 +186,8 @@ def test_kill_at_write_same_command_gives_same_bits(unbroken, tmp_path, work):
 def test_kill_at_random_moment_same_command_gives_same_bits(unbroken, tmp_path, work):
     want, _, seconds = unbroken(work)
     rng = random.Random(LONG)
-    for number in range(max(LONG // 10, 1)):
-        check(tmp_path / str(number), work, want, after=0.01 + rng.random() * seconds)
+    kills = max(LONG // 10, 1)
+    for number in range(kills):
+        folder = tmp_path / str(number)
+        moment = 0.01 + rng.random() * seconds
+        check(folder, work, want, after=moment)
