@@ -174,6 +174,16 @@ def test_poisson_of_points_with_gradients_keeps_the_same_points(rand):
     assert torch.equal(kept, sampler(points).indices)
 
 
+def test_poisson_by_weight_keeps_heavy_points(rand):
+    points = rand(2, 300, 3)
+    weight = rand(2, 300) + 0.01
+
+    rows = PoissonSampler(150).sample_weighted(points, 150, weight)
+
+    weight_of_kept = weight.gather(1, rows)
+    assert (weight_of_kept.mean(1) > 1.2 * weight.mean(1)).all()
+
+
 @pytest.mark.parametrize("m", [2, 5, 12])
 def test_spacing_bound_is_upper_bound(m, rng, randn):
     points = randn(20, 30, 3, dtype=torch.float64)
