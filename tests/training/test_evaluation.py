@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 from mops_lightning.config.compose import compose
 from mops_lightning.config.overrides import readable
 from mops_lightning.errors import UserError
-from mops_lightning.training.as_trained import as_trained
+from mops_lightning.training.as_trained import as_trained, lost_baselines
 from mops_lightning.training.evaluation import TrainedRun, command_line
 from tests.support.command_line import TINY
 from tests.support.records import record
@@ -86,6 +86,26 @@ def test_evaluation_repeats_removed_and_added_baselines(given, tmp_path):
     assert evaluated(run).baselines == compose([*OVERRIDES, given]).baselines
     start = "+baselines.fps.start=farthest"
     assert evaluated(run, start).baselines.fps == compose([*OVERRIDES, start]).baselines.fps
+
+
+def test_baselines_of_an_experiment_are_named_as_lost(tmp_path):
+    added = {"_target_": "mops_lightning.samplers.fps.FPSSampler", "start": "farthest"}
+    with_one_more = {**composed(*OVERRIDES)["baselines"], "fps_farthest": added}
+    run = write_run(tmp_path / "run", changes={"baselines": with_one_more})
+    trained = TrainedRun.read(str(run))
+    cfg = evaluated(run)
+
+    lost = lost_baselines(cfg, trained, [f"evaluate={run}"])
+
+    assert lost == ["fps_farthest"]
+    assert lost_baselines(cfg, trained, ["baselines={}"]) == []
+    assert lost_baselines(cfg, trained, ["baselines.fps=null"]) == []
+
+
+def test_baselines_of_a_run_as_by_default_are_not_lost(run):
+    trained = TrainedRun.read(str(run))
+
+    assert lost_baselines(evaluated(run), trained, [f"evaluate={run}"]) == []
 
 
 def test_command_line_run_named_in_several_ways(run, tmp_path):

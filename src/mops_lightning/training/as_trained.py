@@ -58,6 +58,27 @@ def as_trained(cfg: DictConfig, trained: TrainedRun, arguments: list[str]) -> Di
     return merged
 
 
+def lost_baselines(cfg: DictConfig, trained: TrainedRun, arguments: list[str]) -> list[str]:
+    """Return the baselines of a run that its evaluation does not test, though nobody removed them.
+
+    Those that an experiment's file had added name code, and none is taken from a record.
+
+    Args:
+        cfg: the settings of the evaluation, from ``as_trained``.
+        trained: the run.
+        arguments: the overrides of the evaluation.
+    """
+    if trained.trained_task_net or any(is_of_baselines(argument) for argument in arguments):
+        return []
+    known = trained.record.config.get("baselines") or {}
+    return [name for name in known if name not in (cfg.baselines or {})]
+
+
+def is_of_baselines(argument: str) -> bool:
+    """Return whether an override changes the baselines."""
+    return overrides.path(argument).partition(".")[0] == "baselines"
+
+
 def _check_special(trained: TrainedRun, changed: list[str]) -> None:
     """Refuse a record whose user named a class, unless the user of this evaluation names one.
 

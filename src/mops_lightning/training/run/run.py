@@ -14,7 +14,7 @@ from mops_lightning.data.clouds import CloudDataset, noisy, scale_warning
 from mops_lightning.errors import UserError
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.records.summary import closing_lines
-from mops_lightning.training.as_trained import as_trained
+from mops_lightning.training.as_trained import as_trained, lost_baselines
 from mops_lightning.training.evaluation import TrainedRun
 from mops_lightning.training.run import pretrain
 from mops_lightning.training.run.build import build_parts
@@ -58,6 +58,8 @@ def run_in(folder: Path, cfg: DictConfig, overrides: list[str]) -> RunRecord:
     """
     trained = TrainedRun.read(cfg.evaluate) if cfg.evaluate else None
     writes = not distributed.is_worker_rank(cfg)
+    if trained and writes:
+        _say_lost_baselines(lost_baselines(cfg, trained, overrides), trained.name)
     settings: Any = OmegaConf.to_container(cfg, resolve=True)
     with sigterm_as_ctrl_c(), recorded(settings, folder, overrides, writes) as record:
         with record.timed("data"):
@@ -84,6 +86,15 @@ def checked(cfg: DictConfig, overrides: list[str]) -> DictConfig:
         return as_trained(cfg, TrainedRun.read(cfg.evaluate), overrides)
     check(cfg)
     return cfg
+
+
+def _say_lost_baselines(names: list[str], run_name: str) -> None:
+    if names:
+        print(
+            f"Not tested here: {', '.join(names)}, which an experiment had added to the baselines "
+            f"of {run_name}. +sampler@baselines.{names[0]}=SAMPLER adds it.",
+            flush=True,
+        )
 
 
 def claim(folder: Path) -> None:
