@@ -23,7 +23,12 @@ from mops_lightning.tasks.segmentation import Segmentation
 from mops_lightning.types import UNKNOWN, Batch
 
 cloud_folder = partial(
-    folder.cloud_folder, test_frames=None, crop="whole", crops=2, n_points=20, label="kind"
+    folder.cloud_folder,
+    test_frames=None,
+    crop="whole",
+    crops=2,
+    n_points=20,
+    label="kind",
 )
 
 
@@ -31,7 +36,9 @@ class Halves(nn.Module):
     """Knows the sign of x."""
 
     def forward(self, points):
-        return torch.stack([-points[..., 0], points[..., 0]], 2) * 50
+        right = 50 * points[..., 0]
+        left = -right
+        return torch.stack([left, right], 2)
 
 
 def small_net(parts):
@@ -42,11 +49,14 @@ def small_net(parts):
 
 def plainly_interpolated(values, points, query):
     """Return the mean of the values at the 3 nearest points, weighted by inverse squares."""
-    squared = (points - query).square().sum(1)
-    near = squared.argsort()[:3]
-    weights = 1 / squared[near]
-    weighted = values[near] * weights[:, None]
-    return weighted.sum(0) / weights.sum()
+    offsets = points - query
+    squared = offsets.square().sum(1)
+    in_order = squared.argsort()
+    nearest = in_order[:3]
+    weights = 1 / squared[nearest]
+    weighted = values[nearest] * weights[:, None]
+    total = weighted.sum(0)
+    return total / weights.sum()
 
 
 def test_interpolation_equals_plain_loops(rand):
@@ -56,10 +66,14 @@ def test_interpolation_equals_plain_loops(rand):
 
     found = interpolate(values, points, queries)
 
+    assert found.shape == (2, 9, 4)
     for cloud in range(2):
-        for query, row in zip(queries[cloud], found[cloud], strict=True):
-            expected = plainly_interpolated(values[cloud], points[cloud], query)
-            assert_close(row, expected, rtol=1e-4, atol=1e-5)
+        of_cloud = values[cloud]
+        points_of_cloud = points[cloud]
+        for number in range(9):
+            query = queries[cloud, number]
+            expected = plainly_interpolated(of_cloud, points_of_cloud, query)
+            assert_close(found[cloud, number], expected, rtol=1e-4, atol=1e-5)
 
 
 def test_interpolation_at_the_points_returns_their_values(rand):
@@ -76,13 +90,16 @@ def test_interpolation_from_a_single_point_keeps_its_shape(rand):
     points = rand(2, 1, 3)
     queries = rand(2, 9, 3)
 
-    assert interpolate(values, points, queries).shape == (2, 9, 4)
+    found = interpolate(values, points, queries)
+
+    assert found.shape == (2, 9, 4)
 
 
 def test_interpolation_gradients_equal_differences(rand):
-    values = rand(1, 6, 4, dtype=torch.float64, requires_grad=True)
-    points = rand(1, 6, 3, dtype=torch.float64, requires_grad=True)
-    queries = rand(1, 9, 3, dtype=torch.float64, requires_grad=True)
+    differentiable = partial(rand, dtype=torch.float64, requires_grad=True)
+    values = differentiable(1, 6, 4)
+    points = differentiable(1, 6, 3)
+    queries = differentiable(1, 9, 3)
 
     assert torch.autograd.gradcheck(interpolate, (values, points, queries))
 
@@ -100,27 +117,30 @@ def iou(predictions, parts, part):
 def halves(randn):
     """Clouds with two halves, x above 0 and below."""
     points = randn(3, 200, 3)
-    parts = (points[..., 0] > 0).long()
+    is_right = points[..., 0] > 0
     labels = torch.zeros(3, dtype=torch.int64)
-    return Batch(points, labels, parts=parts)
+    return Batch(points, labels, parts=is_right.long())
 
 
 def test_all_points_are_scored_from_few(halves):
     task = Segmentation(Halves(), 2)
+    sample = halves.points[:, :25]
 
-    few = task.step(halves, halves.points[:, :25])
+    result = task.step(halves, sample)
 
-    assert few.predictions.shape == (3, 200)
-    assert few.targets.shape == (3, 200)
-    right = few.predictions.eq(halves.parts).float().mean()
-    assert 0.7 < right < 1
+    predictions = result.predictions
+    assert predictions.shape == (3, 200)
+    assert result.targets.shape == (3, 200)
+    is_right = predictions == halves.parts
+    accuracy = is_right.float().mean()
+    assert 0.7 < accuracy < 1
+    iou_of_left = iou(predictions, halves.parts, 0)
+    iou_of_right = iou(predictions, halves.parts, 1)
+    mean_iou = (iou_of_left + iou_of_right) / 2
     metrics = task.metrics()
-    metrics.update(few.predictions, few.targets)
+    metrics.update(predictions, result.targets)
     values = metrics.compute()
-    assert values["point_accuracy"] == pytest.approx(right.item())
-    left_iou = iou(few.predictions, halves.parts, 0)
-    right_iou = iou(few.predictions, halves.parts, 1)
-    mean_iou = (left_iou + right_iou) / 2
+    assert values["point_accuracy"] == pytest.approx(accuracy.item())
     assert values["mean_iou"] == pytest.approx(mean_iou, abs=1e-6)
 
 
@@ -130,16 +150,20 @@ def test_loss_of_all_points_is_below_that_of_few(halves):
     few = task.step(halves, halves.points[:, :25])
     every = task.step(halves, halves.points)
 
-    assert every.losses["cross_entropy"] < few.losses["cross_entropy"]
+    loss_of_few = few.losses["cross_entropy"]
+    loss_of_all = every.losses["cross_entropy"]
+    assert loss_of_all < loss_of_few
 
 
 def test_prediction_of_a_copy_of_the_points_is_the_same(halves):
     task = Segmentation(Halves(), 2)
 
-    same = task.predict(halves, halves.points)
-    copy = task.predict(halves, halves.points.clone())
+    copy = halves.points.clone()
 
-    assert_close(same, copy, atol=1e-2, rtol=1e-4)
+    of_points = task.predict(halves, halves.points)
+    of_copy = task.predict(halves, copy)
+
+    assert_close(of_points, of_copy, atol=1e-2, rtol=1e-4)
 
 
 def test_segmentation_without_parts_is_refused(halves):
@@ -157,36 +181,45 @@ def test_segmentation_into_one_part_is_refused():
 
 def test_points_of_unknown_part_are_neither_learned_nor_scored(randn, rand):
     points = randn(2, 99, 3)
-    known = rand(2, 99) > 0.3
-    parts = (points[..., 1] > 0).long()
+    is_known = rand(2, 99) > 0.3
+    is_above = points[..., 1] > 0
+    all_parts = is_above.long()
+    some_parts = all_parts.where(is_known, UNKNOWN)
+    no_parts = torch.full_like(all_parts, UNKNOWN)
     labels = torch.zeros(2).long()
-    some_known = Batch(points, labels, parts=parts.where(known, UNKNOWN))
-    none_known = Batch(points, labels, parts=torch.full_like(parts, UNKNOWN))
+    some_known = Batch(points, labels, parts=some_parts)
+    none_known = Batch(points, labels, parts=no_parts)
     task = Segmentation(Halves(), 2)
 
-    found = task.step(some_known, points)
-    nothing = task.step(none_known, points)
+    of_some = task.step(some_known, points)
+    of_none = task.step(none_known, points)
 
+    known_parts = all_parts[is_known]
     logits = task.predict(some_known, points)
-    loss = F.cross_entropy(logits[known], parts[known])
-    assert_close(found.losses["cross_entropy"], loss)
-    scores = task.metrics()(found.predictions, found.targets)
-    scores_of_known = task.metrics()(found.predictions[known], parts[known])
-    assert scores == scores_of_known
-    assert nothing.losses["cross_entropy"] == 0
+    expected_loss = F.cross_entropy(logits[is_known], known_parts)
+    assert_close(of_some.losses["cross_entropy"], expected_loss)
+    metrics = task.metrics()
+    metrics_of_known = task.metrics()
+    scores = metrics(of_some.predictions, of_some.targets)
+    expected_scores = metrics_of_known(of_some.predictions[is_known], known_parts)
+    assert scores == expected_scores
+    assert of_none.losses["cross_entropy"] == 0
 
 
 def test_loss_of_a_single_known_point_is_its_own(randn):
     points = randn(2, 30, 3)
+    labels = torch.zeros(2).long()
+    part = torch.tensor(1)
     parts = torch.full((2, 30), UNKNOWN)
-    parts[1, 7] = 1
-    batch = Batch(points, torch.zeros(2).long(), parts=parts)
-    task = Segmentation(small_net(2), 2).eval()
+    parts[1, 7] = part
+    batch = Batch(points, labels, parts=parts)
+    task = Segmentation(small_net(2), 2)
+    task.eval()
 
     result = task.step(batch, points)
 
-    (logits,) = task.predict(batch, points)[1:, 7]
-    expected = F.cross_entropy(logits, torch.tensor(1))
+    logits = task.predict(batch, points)
+    expected = F.cross_entropy(logits[1, 7], part)
     assert_close(result.losses["cross_entropy"], expected)
 
 
@@ -201,33 +234,40 @@ def test_step_passes_on_the_logits_of_all_points(halves):
 
 def test_disagreement_is_the_mean_divergence_of_the_points_of_a_cloud():
     task = Segmentation(Halves(), 2)
-    even = torch.tensor([0.5, 0.5]).log()
-    uneven = torch.tensor([0.9, 0.1]).log()
-    found = torch.stack([uneven, even, even])
-    reference = torch.stack([uneven, uneven, even])
+    even = [0.5, 0.5]
+    uneven = [0.9, 0.1]
+    found = torch.tensor([[uneven, even, even]])
+    reference = torch.tensor([[uneven, uneven, even]])
 
-    apart = task.disagreement(found[None], reference[None])
+    apart = task.disagreement(found.log(), reference.log())
 
-    of_second_point = 0.9 * math.log(0.9 / 0.5) + 0.1 * math.log(0.1 / 0.5)
-    assert apart.tolist() == pytest.approx([of_second_point / 3])
+    of_first_part = 0.9 * math.log(0.9 / 0.5)
+    of_second_part = 0.1 * math.log(0.1 / 0.5)
+    of_second_point = of_first_part + of_second_part
+    mean_of_points = of_second_point / 3
+    assert apart.tolist() == pytest.approx([mean_of_points])
 
 
 @pytest.mark.parametrize("k", [0, -1])
 def test_interpolation_from_no_point_is_refused(k):
+    net = Halves()
+
     with pytest.raises(UserError, match=rf"k must be at least 1, got {k}\."):
-        Segmentation(Halves(), 2, k)
+        Segmentation(net, 2, k)
 
 
 def test_net_follows_order_of_points(rng, randn):
     net = small_net(5).eval()
     points = randn(2, 40, 3)
     order = torch.randperm(40, generator=rng)
+    reordered = points[:, order]
 
     logits = net(points)
-    logits_in_order = net(points[:, order])
+    logits_of_reordered = net(reordered)
 
     assert logits.shape == (2, 40, 5)
-    assert_close(logits_in_order, logits[:, order], atol=1e-4, rtol=1e-4)
+    expected = logits[:, order]
+    assert_close(logits_of_reordered, expected, atol=1e-4, rtol=1e-4)
 
 
 def test_net_takes_fewer_points_than_its_stages_sample(randn):
@@ -243,7 +283,8 @@ def test_net_trains_every_weight(randn):
     net = small_net(5).train()
     points = randn(2, 40, 3)
 
-    loss = net(points).square().sum()
+    logits = net(points)
+    loss = logits.square().sum()
     loss.backward()
 
     for name, weights in net.named_parameters():
@@ -261,8 +302,8 @@ def test_shapes_know_their_parts(tmp_path):
     train: Any = data.train
     for label, name in enumerate(data.class_names):
         is_of_class = train.labels == label
-        parts_of_class = train.parts[is_of_class].unique()
-        names = {data.part_names[part] for part in parts_of_class}
+        parts_of_class = train.parts[is_of_class]
+        names = {data.part_names[part] for part in parts_of_class.unique()}
         assert names <= set(PARTS[name])
     seat = data.part_names.index("seat")
     leg = data.part_names.index("leg")
@@ -271,25 +312,40 @@ def test_shapes_know_their_parts(tmp_path):
         is_leg = parts == leg
         if is_seat.any():
             height = cloud[:, 1]
-            assert height[is_leg].mean() < height[is_seat].mean()
+            height_of_legs = height[is_leg].mean()
+            height_of_seat = height[is_seat].mean()
+            assert height_of_legs < height_of_seat
     cached: Any = from_cache.train
     assert torch.equal(cached.parts, train.parts)
-    is_chair = train.labels == data.class_names.index("chair")
+    chair = data.class_names.index("chair")
+    is_chair = train.labels == chair
+    chairs = train.take(is_chair)
     assert alone.part_names == PARTS["chair"]
     assert torch.equal(alone.train.points, train.points[is_chair])
-    assert train.take(is_chair).parts.shape == (12, 256)
+    assert chairs.parts.shape == (12, 256)
     assert without_parts.part_names == ()
+
+
+KINDS_OF_SCANS = [
+    ("scan0", 7, 2, -1),
+    ("scan1", 2, 40, -2),
+]
+"""Each scan's name, its kinds on the right and on the left, and its value for unknown."""
 
 
 @pytest.fixture(params=[".ply", ".npz"])
 def scans(request, tmp_path, rand):
     """A folder of two scans, whose columns ``kind`` hold other numbers left and right."""
     suffix = request.param
-    for number, kinds in enumerate(([7, 2], [2, 40])):
+    write = WRITERS[suffix]
+    for name, kind_of_right, kind_of_left, unknown in KINDS_OF_SCANS:
         points = rand(60, 3).double().numpy()
-        kind = np.where(points[:, 0] > 0.5, *kinds).astype(np.int16)
-        kind[::4] = -1 - number
-        WRITERS[suffix](tmp_path / f"scan{number}{suffix}", Table(points, {"kind": kind}))
+        is_right = points[:, 0] > 0.5
+        kind = np.where(is_right, kind_of_right, kind_of_left)
+        kind[::4] = unknown
+        columns = {"kind": kind.astype(np.int16)}
+        path = tmp_path / f"{name}{suffix}"
+        write(path, Table(points, columns))
     return tmp_path
 
 
@@ -303,8 +359,9 @@ def test_scans_have_parts_of_their_own(scans):
             unknown, low, high = parts.unique().tolist()
             assert unknown == UNKNOWN
             x = cloud[:, 0]
-            between = x[parts == high].mean() - x[parts == low].mean()
-            assert abs(between) > 0.3
+            x_of_high = x[parts == high].mean()
+            x_of_low = x[parts == low].mean()
+            assert abs(x_of_high - x_of_low) > 0.3
 
 
 def test_scans_without_label_have_no_parts(scans):
@@ -329,7 +386,10 @@ def test_scans_with_broken_numbers_as_labels_are_refused(scans):
     suffix = first.suffix
     points = np.tile(np.eye(3), (20, 1))
     kind = np.full(60, 0.5)
-    WRITERS[suffix](scans / f"scan2{suffix}", Table(points, {"kind": kind}))
+    table = Table(points, {"kind": kind})
+    path = scans / f"scan2{suffix}"
+    write = WRITERS[suffix]
+    write(path, table)
 
     with pytest.raises(UserError, match=r"'kind' must hold whole int64 numbers, got 0\.5\."):
         cloud_folder(scans)
