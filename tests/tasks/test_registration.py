@@ -30,11 +30,12 @@ class Kabsch(torch.nn.Module):
             centred_source = source_cloud - source_mean
             centred_target = target_cloud - target_mean
             rotation, _ = Rotation.align_vectors(centred_target, centred_source)
+            shift = target_mean - rotation.apply(source_mean)
             quaternions.append(rotation.as_quat(scalar_first=True))
-            shifts.append(target_mean - rotation.apply(source_mean))
-        quaternion = torch.tensor(np.array(quaternions)).float()
-        shift = torch.tensor(np.array(shifts)).float()
-        return Motion(quaternion, shift)
+            shifts.append(shift)
+        quaternion = torch.tensor(np.array(quaternions))
+        translation = torch.tensor(np.array(shifts))
+        return Motion(quaternion.float(), translation.float())
 
 
 def small_net():
@@ -43,40 +44,53 @@ def small_net():
 
 
 def task(net=None, **settings):
-    return Registration(net or small_net(), **settings)
+    if net is None:
+        net = small_net()
+    return Registration(net, **settings)
 
 
 def test_step_exact_net_recovers_motions(randn):
+    module = task(Kabsch())
     source = randn(5, 40, 3) + 3  # far from its centroid
     true = motion(1)
-    batch = pair_batch(source, true.apply(source), true)
+    target = true.apply(source)
+    batch = pair_batch(source, target, true)
 
-    result = task(Kabsch()).step(batch, batch.points)
+    result = module.step(batch, batch.points)
 
     found = result.predictions
+    degrees = RotationError.of(found, true)
+    loss = sum(result.losses.values())
     assert torch.equal(result.targets.translation, true.translation)
-    assert RotationError.of(found, true).max() < 1e-2
+    assert degrees.max() < 1e-2
     assert_close(found.translation, true.translation, atol=1e-4, rtol=0)
-    assert sum(result.losses.values()) < 1e-3
+    assert loss < 1e-3
 
 
 def test_disagreement_of_shifted_motions_is_squared_shift():
+    module = task()
     true = motion(1)
     shift = torch.tensor([1.0, -2.0, 0.5])
-    moved = true._replace(translation=true.translation + shift)
+    shifted = true.translation + shift
+    moved = true._replace(translation=shifted)
 
-    apart = task().disagreement(moved, true)
+    apart = module.disagreement(moved, true)
 
-    expected = 1 + 2**2 + 0.5**2
-    assert_close(apart, torch.full_like(apart, expected))
+    squared_shift = 1 + 2**2 + 0.5**2
+    expected = torch.full_like(apart, squared_shift)
+    assert_close(apart, expected)
 
 
 def test_disagreement_of_turned_motions_is_that_of_the_turned_axes():
-    still = Motion(torch.tensor([[1.0, 0, 0, 0]]), torch.zeros(1, 3))
+    module = task()
     half = 0.5**0.5
-    quarter_turn = Motion(torch.tensor([[half, half, 0, 0]]), torch.zeros(1, 3))
+    no_shift = torch.zeros(1, 3)
+    no_turn = torch.tensor([[1.0, 0, 0, 0]])
+    quarter_turn = torch.tensor([[half, half, 0, 0]])
+    still = Motion(no_turn, no_shift)
+    turned = Motion(quarter_turn, no_shift)
 
-    apart = task().disagreement(quarter_turn, still)
+    apart = module.disagreement(turned, still)
 
     # Two unit axes end a square root of 2 away.
     assert apart.tolist() == pytest.approx([4.0])
@@ -88,62 +102,85 @@ class RecordingSampler(FPSSampler):
         self.shapes = []
 
     def sample(self, points, m):
-        self.shapes.append(tuple(points.shape))
+        shape = tuple(points.shape)
+        self.shapes.append(shape)
         return super().sample(points, m)
 
 
 def test_test_samples_sources_and_targets_in_one_call():
     sampler = RecordingSampler(8)
-    module = Experiment(task(resample=40), sampler, sizes=(4, 8))
+    registration = task(resample=40)
+    module = Experiment(registration, sampler, sizes=(4, 8))
     clouds = small_dataset(test=4).test
-    loader = CloudLoader(clouds, 4, make_batch=module.task.make_batch)
+    loader = CloudLoader(clouds, 4, make_batch=registration.make_batch)
+    trainer = quiet_trainer(1)
 
-    quiet_trainer(1).test(module, loader, verbose=False)
+    trainer.test(module, loader, verbose=False)
 
-    assert sampler.shapes == [(8, 40, 3)]
+    four_sources_and_four_targets = (8, 40, 3)
+    assert sampler.shapes == [four_sources_and_four_targets]
 
 
 def text_of(axes):
-    return axes.texts[0].get_text()
+    first_text = axes.texts[0]
+    return first_text.get_text()
+
+
+def numbers_of_sets(row):
+    """Return how many sets of points each picture of a row draws."""
+    return [len(axes.collections) for axes in row]
 
 
 def test_figures_show_every_readout_and_its_error(rng):
     module = task()
-    loader = CloudLoader(small_dataset().test, 4, make_batch=module.make_batch)
-    batch = loader.batch_of(torch.tensor([0, 1]))
-    sample = FPSSampler(8)(batch.points).points
+    clouds = small_dataset().test
+    loader = CloudLoader(clouds, 4, make_batch=module.make_batch)
+    first_two = torch.tensor([0, 1])
+    batch = loader.batch_of(first_two)
+    fps = FPSSampler(8)
+    sample = fps(batch.points).points
     samples = {"sampled": sample, "full": batch.points}
 
     figures = figures_of(module, batch, samples, ["long", "tall"])
 
-    axes = figures["pairs"].axes
-    result = module.step(batch, batch.points)
-    still = identity_motion(batch.points[:2])
-    _, error = RotationError.of(result.predictions, result.targets)
-    _, angle = RotationError.of(result.targets, still)
+    first_row = figures["pairs"].axes[:3]
+    second_row = figures["pairs"].axes[3:]
     # Samples have rings, full clouds have none.
-    numbers_of_sets = [len(cell.collections) for cell in axes]
-    titles = [cell.get_title() for cell in axes[:3]]
-    assert numbers_of_sets == [2, 4, 2, 2, 4, 2]
+    assert numbers_of_sets(first_row) == [2, 4, 2]
+    assert numbers_of_sets(second_row) == [2, 4, 2]
+    titles = [axes.get_title() for axes in first_row]
     assert titles == ["before (centred)", "by sampled", "by full"]
-    assert text_of(axes[3]) == f"tall, {angle:.1f}° apart"
-    assert text_of(axes[5]) == f"rotation error {error:.1f}°"
+    before, _, by_full = second_row
+    result = module.step(batch, batch.points)
+    sources, _ = batch.points.chunk(2)
+    still = identity_motion(sources)
+    _, angle = RotationError.of(result.targets, still)
+    _, error = RotationError.of(result.predictions, result.targets)
+    assert text_of(before) == f"tall, {angle:.1f}° apart"
+    assert text_of(by_full) == f"rotation error {error:.1f}°"
 
 
 def test_figures_draw_sources_on_their_targets_after_the_true_motion(randn):
     module = task(Kabsch())
     source = randn(2, 30, 3) + 3  # far from its centroid
     true = motion(1, number=2)
-    batch = pair_batch(source, true.apply(source), true)
+    target = true.apply(source)
+    batch = pair_batch(source, target, true)
     sample = batch.points[:, :6]
 
     figures = figures_of(module, batch, {"sampled": sample}, ["long", "tall"])
 
-    for axes in (figures["pairs"].axes[1], figures["pairs"].axes[3]):
-        moved, target, moved_sample, sample_of_target = map(drawn_places, axes.collections)
-        assert moved == pytest.approx(target, abs=1e-4)
-        assert moved_sample == pytest.approx(sample_of_target, abs=1e-4)
+    _, first_after, _, second_after = figures["pairs"].axes
+    for axes in (first_after, second_after):
+        places = [drawn_places(collection) for collection in axes.collections]
+        drawn_source, drawn_target, sample_of_source, sample_of_target = places
+        assert drawn_source == pytest.approx(drawn_target, abs=1e-4)
+        assert sample_of_source == pytest.approx(sample_of_target, abs=1e-4)
 
 
 def test_clouds_of_a_pair_have_titles_of_their_own():
-    assert cloud_titles(task(), ["long"]) == ["long_source", "long_target"]
+    module = task()
+
+    titles = cloud_titles(module, ["long"])
+
+    assert titles == ["long_source", "long_target"]
