@@ -14,36 +14,48 @@ from mops_lightning.viz.task_results import ReconstructionResult, reconstruction
 
 
 def pixels(figure, tmp_path):
-    path = figures.save_figure(figure, tmp_path / "figure.png")
-    return matplotlib.image.imread(path)[..., :3]
+    path = tmp_path / "figure.png"
+    saved = figures.save_figure(figure, path)
+    image = matplotlib.image.imread(saved)
+    return image[..., :3]
 
 
 def marked(image, name):
     """Return the number of pixels in the colour of a readout."""
-    colour = np.array(figures.COLOURS[name]) / 255
-    return near_colour(image, colour, 0.02).sum()
+    colour = np.array(figures.COLOURS[name])
+    is_marked = near_colour(image, colour / 255, 0.02)
+    return is_marked.sum()
 
 
 def near_colour(image, colour, tolerance):
     """Return which pixels are within a tolerance of a colour in every channel."""
-    return np.abs(image - colour).max(2) < tolerance
+    differences = np.abs(image - colour)
+    largest = differences.max(2)
+    return largest < tolerance
 
 
 def column_of(image, number, columns):
     """Return the pixels of one column of a grid of clouds."""
     width = image.shape[1] // columns
-    return image[:, number * width : (number + 1) * width]
+    left = number * width
+    right = left + width
+    return image[:, left:right]
 
 
 def marked_in_column(image, number, columns, name):
     """Return the number of pixels in the colour of a readout, in one column of a grid."""
-    return marked(column_of(image, number, columns), name)
+    column = column_of(image, number, columns)
+    return marked(column, name)
 
 
 def test_cloud_grid_draws_readout_in_its_colour(tmp_path, rand):
     points = rand(2, 300, 3)
     samples = points[:, :20]
-    readouts = {"generated": samples, "matched": samples, "completed": samples}
+    readouts = {
+        "generated": samples,
+        "matched": samples,
+        "completed": samples,
+    }
 
     figure = figures.cloud_grid(points, readouts, ["chair", "vase"])
 
@@ -55,8 +67,9 @@ def test_cloud_grid_draws_readout_in_its_colour(tmp_path, rand):
 
 def test_cloud_grid_names_clouds_and_readouts(rand):
     points = rand(2, 300, 3)
+    readouts = {"matched": points[:, :20]}
 
-    figure = figures.cloud_grid(points, {"matched": points[:, :20]}, ["chair", "vase"])
+    figure = figures.cloud_grid(points, readouts, ["chair", "vase"])
 
     texts = set()
     for axes in figure.axes:
@@ -68,35 +81,43 @@ def test_cloud_grid_names_clouds_and_readouts(rand):
 
 @pytest.mark.parametrize("number", [30, 1000])
 def test_matrix_figure_shows_ideal_matrix_as_diagonal_and_every_large_entry(number):
+    middle = number // 2
+    last = number - 1
     dense = torch.zeros(number, 4)
-    dense[number // 2, 0] = 1.0
+    dense[middle, 0] = 1.0
     dense[3, 1] = 1.0
-    dense[number - 1, 2] = 1.0
+    dense[last, 2] = 1.0
     dense[7, 3] = 1.0
     gram = dense.T @ dense
 
     figure = figures.matrix_figure(dense, gram, "chair")
 
-    (left,) = figure.axes[0].images
-    (right,) = figure.axes[1].images
-    drawn = np.asarray(left.get_array())
-    assert drawn.max(0).tolist() == [1.0, 1.0, 1.0, 1.0]
+    axes_of_matrix, axes_of_gram = figure.axes[:2]
+    (matrix,) = axes_of_matrix.images
+    drawn = np.asarray(matrix.get_array())
+    largest = drawn.max(0)
+    assert largest.tolist() == [1.0, 1.0, 1.0, 1.0]
     if number == 30:
         rows = drawn.argmax(0)
-        assert (np.diff(rows) > 0).all()
-    assert list(left.get_extent()) == [-0.5, 3.5, number - 0.5, -0.5]
-    drawn_gram = np.asarray(right.get_array())
+        steps = np.diff(rows)
+        assert (steps > 0).all()
+    bottom = number - 0.5
+    assert list(matrix.get_extent()) == [-0.5, 3.5, bottom, -0.5]
+    (gram_image,) = axes_of_gram.images
+    drawn_gram = np.asarray(gram_image.get_array())
     np.testing.assert_array_equal(drawn_gram, np.eye(4))
 
 
 def test_cloud_grid_draws_samples_over_dense_cloud(tmp_path, randn):
-    points = F.normalize(randn(8192, 3), dim=1)
-    is_far = points[:, 0] < -0.3
-    far = points[is_far][:100]
-    readouts = {"matched": far[None]}
+    sphere = F.normalize(randn(8192, 3), dim=1)
+    is_far = sphere[:, 0] < -0.3
+    all_far = sphere[is_far]
+    dense = sphere[None]
+    sample = all_far[None, :100]
+    readouts = {"matched": sample}
 
-    over_dense = figures.cloud_grid(points[None], readouts, [""])
-    alone = figures.cloud_grid(far[None], readouts, [""])
+    over_dense = figures.cloud_grid(dense, readouts, [""])
+    alone = figures.cloud_grid(sample, readouts, [""])
 
     image_over_dense = pixels(over_dense, tmp_path)
     image_alone = pixels(alone, tmp_path)
@@ -109,13 +130,14 @@ def test_cloud_grid_draws_samples_over_dense_cloud(tmp_path, randn):
 def test_comparison_draws_every_sample_and_whole_cloud(tmp_path, rand):
     points = rand(300, 3)
     sample = points[:20]
+    samples = {"fps": sample, "generated": sample}
     captions = {
         "fps": "fps: 78.75 %",
         "generated": "MOPSNet: 96.25 %",
         "full": "all points",
     }
 
-    figure = figures.comparison(points, {"fps": sample, "generated": sample}, captions)
+    figure = figures.comparison(points, samples, captions)
 
     titles = [axes.get_title() for axes in figure.axes]
     assert titles == ["fps: 78.75 %", "MOPSNet: 96.25 %", "all points"]
@@ -125,19 +147,22 @@ def test_comparison_draws_every_sample_and_whole_cloud(tmp_path, rand):
 
 
 def test_save_figure_png_has_a_palette_near_the_colours(tmp_path):
-    colours = np.random.default_rng(0).random((4, 4, 3))
+    rng = np.random.default_rng(0)
+    squares = rng.random((4, 4, 3))
     figure = figures.new_figure(4, 4)
-    figure.subplots().imshow(colours, interpolation="nearest")
+    axes = figure.subplots()
+    axes.imshow(squares, interpolation="nearest")
+    path = tmp_path / "a.png"
 
-    path = figures.save_figure(figure, tmp_path / "a.png", dpi=100)
+    saved = figures.save_figure(figure, path, dpi=100)
 
-    with Image.open(path) as image:
+    with Image.open(saved) as image:
         assert image.size == (400, 400)
         assert image.mode == "P"
         drawn = np.asarray(image.convert("RGB")) / 255
-    for colour in colours.reshape(-1, 3):
-        distances = np.abs(drawn - colour).max(2)
-        assert distances.min() < 0.02
+    for colour in squares.reshape(-1, 3):
+        is_near = near_colour(drawn, colour, 0.02)
+        assert is_near.any()
 
 
 def test_save_clouds_large_thins_input_and_keeps_samples(tmp_path, rand):
@@ -150,7 +175,8 @@ def test_save_clouds_large_thins_input_and_keeps_samples(tmp_path, rand):
     titles, arrays = figures.load_clouds(path)
     assert titles == ["a", "b"]
     assert list(arrays) == ["input", "generated"]
-    assert arrays["input"].shape[1] <= figures.MAX_INPUT_POINTS
+    _, number_of_points, _ = arrays["input"].shape
+    assert number_of_points <= figures.MAX_INPUT_POINTS
     np.testing.assert_array_equal(arrays["generated"], samples.numpy())
 
 
@@ -172,13 +198,16 @@ DAMAGES: dict[str, dict[str, np.ndarray]] = {
 def test_load_clouds_damaged_file_is_refused(tmp_path, rand, damage):
     path = tmp_path / "clouds.npz"
     points = rand(2, 50, 3)
-    figures.save_clouds(path, points, {"generated": points[:, :4]}, ["a", "b"])
-    arrays = dict(np.load(path)) | DAMAGES[damage]
+    samples = {"generated": points[:, :4]}
+    figures.save_clouds(path, points, samples, ["a", "b"])
+    arrays = dict(np.load(path))
+    arrays.update(DAMAGES[damage])
     if damage == "no samples":
         del arrays["generated"]
     np.savez(path, **arrays)
     if damage == "cut":
-        path.write_bytes(path.read_bytes()[:-200])
+        content = path.read_bytes()
+        path.write_bytes(content[:-200])
     elif damage == "text":
         path.write_bytes(b"text")
 
@@ -189,7 +218,9 @@ def test_load_clouds_damaged_file_is_refused(tmp_path, rand, damage):
 def test_reconstruction_grid_thins_large_clouds_only(rand):
     most = figures.MAX_INPUT_POINTS
     points = rand(1, 2 * most, 3)
-    result = ReconstructionResult(points[:, :8], points[:, :100], [1.5])
+    sample = points[:, :8]
+    from_sample = points[:, :100]
+    result = ReconstructionResult(sample, from_sample, [1.5])
 
     figure = reconstruction_grid(points, points, {"fps": result}, ["chair"])
 
@@ -198,16 +229,17 @@ def test_reconstruction_grid_thins_large_clouds_only(rand):
     assert drawn_points(below) == [most]
     assert drawn_points(samples) == [most, 8]
     assert drawn_points(reconstruction) == [100]
-    assert reconstruction.texts[0].get_text() == "NRE 1.50"
-
-
-def offsets_of(collection):
-    return np.asarray(collection.get_offsets())
+    caption = reconstruction.texts[0]
+    assert caption.get_text() == "NRE 1.50"
 
 
 def drawn_points(axes):
     """Return the number of points of every collection of axes."""
-    return [len(offsets_of(collection)) for collection in axes.collections]
+    numbers = []
+    for collection in axes.collections:
+        offsets = np.asarray(collection.get_offsets())
+        numbers.append(len(offsets))
+    return numbers
 
 
 UPRIGHT_AXES = {
@@ -220,16 +252,18 @@ UPRIGHT_AXES = {
 
 @pytest.mark.parametrize("up", ["x", "y", "z"])
 def test_view_upright_draws_the_upper_end_above_and_no_mirror_image(up):
+    directions = torch.eye(3)
     tripod = torch.zeros(1, 4, 3)  # the origin, and one step to the right, up and to the viewer
-    tripod[0, 1:] = torch.eye(3)[UPRIGHT_AXES[up]]
+    tripod[0, 1:] = directions[UPRIGHT_AXES[up]]
     figure = figures.cloud_grid(tripod, {}, [""])
 
     figures.view_upright(figure, up)
 
     axes: Any = figure.axes[0]
     projection = axes.get_proj()
+    (upright,) = figures.upright(tripod)
     flat = []
-    for point in figures.upright(tripod)[0]:
+    for point in upright:
         x, y, _ = proj3d.proj_transform(*point, projection)
         flat.append(np.array([x, y]))
     origin, right, above, front = flat
@@ -244,9 +278,12 @@ def test_view_upright_draws_the_upper_end_above_and_no_mirror_image(up):
 
 @pytest.mark.parametrize("up", ["x", "y", "z"])
 def test_to_y_up_is_a_rotation_that_raises_the_vertical_axis(up):
-    turned = figures.to_y_up(torch.eye(3), up)
+    axes = torch.eye(3)
+    vertical = "xyz".index(up)
 
-    assert turned["xyz".index(up)].tolist() == [0, 1, 0]
+    turned = figures.to_y_up(axes, up)
+
+    assert turned[vertical].tolist() == [0, 1, 0]
     assert torch.linalg.det(turned) == 1
 
 
@@ -254,8 +291,12 @@ def test_colours_by_channel_have_one_scale_for_all_sets():
     points = torch.zeros(1, 101, 4)
     points[0, :, 3] = torch.arange(101)
     rows = [0, 50, 100]
+    sets = {
+        "input": points,
+        "sampled": points[:, rows],
+    }
 
-    colours = figures.colours_by_channel(3, {"input": points, "sampled": points[:, rows]})
+    colours = figures.colours_by_channel(3, sets)
 
     of_input = colours["input"]
     of_sample = colours["sampled"]
@@ -270,13 +311,12 @@ def test_colours_by_a_constant_channel_are_equal():
 
     colours = figures.colours_by_channel(3, {"input": points})
 
-    different = np.unique(colours["input"].reshape(-1, 3), axis=0)
+    of_points = colours["input"].reshape(-1, 3)
+    different = np.unique(of_points, axis=0)
     assert len(different) == 1
 
 
 BRIGHT = np.array([253, 231, 37]) / 255
-
-
 DARK = np.array([68, 1, 84]) / 255
 
 
@@ -291,8 +331,10 @@ def test_cloud_grid_draws_points_in_the_colours_of_a_channel(tmp_path, rand):
     image = pixels(figure, tmp_path)
     for number in (0, 1):
         column = column_of(image, number, 2)
-        bright_rows, _ = near_colour(column, BRIGHT, 0.1).nonzero()
-        dark_rows, _ = near_colour(column, DARK, 0.1).nonzero()
+        is_bright = near_colour(column, BRIGHT, 0.1)
+        is_dark = near_colour(column, DARK, 0.1)
+        bright_rows, _ = is_bright.nonzero()
+        dark_rows, _ = is_dark.nonzero()
         assert len(bright_rows) > 50
         assert len(dark_rows) > 50
         assert bright_rows.mean() < dark_rows.mean()

@@ -20,12 +20,34 @@ from tests.support.figures import drawn_places
 
 
 def assert_draws(collection, points):
-    np.testing.assert_allclose(drawn_places(collection), figures.upright(points), atol=1e-6)
+    drawn = drawn_places(collection)
+    expected = figures.upright(points)
+    np.testing.assert_allclose(drawn, expected, atol=1e-6)
 
 
 def colour_of(collection):
-    colour = collection.get_facecolor()[0]
-    return tuple(colour[:3])
+    """Return the colour of the first point, without its opacity."""
+    colours = collection.get_facecolor()
+    red, green, blue, _ = colours[0]
+    return (red, green, blue)
+
+
+def drawn_values(collection):
+    """Return the values by which the points of a collection are coloured."""
+    return np.asarray(collection.get_array())
+
+
+def text_of(axes):
+    first_text = axes.texts[0]
+    return first_text.get_text()
+
+
+def texts_of(figure):
+    return [text_of(axes) for axes in figure.axes]
+
+
+def titles_of(figure):
+    return [axes.get_title() for axes in figure.axes]
 
 
 @pytest.fixture
@@ -34,7 +56,9 @@ def pairs(randn):
     source = randn(2, 20, 3)
     target = randn(2, 20, 3)
     moved = source + 1
-    result = RegistrationResult(moved, moved[:, :4], target[:, :5], [1.25, 30.0])
+    source_points = moved[:, :4]
+    target_points = target[:, :5]
+    result = RegistrationResult(moved, source_points, target_points, [1.25, 30.0])
     return source, target, result
 
 
@@ -63,15 +87,13 @@ def test_pair_grid_says_angles_and_errors_of_every_pair(pairs):
 
     figure = pair_grid(source, target, [10.0, 20.0], {"fps": result}, ["a", "b"])
 
-    labels = [axes.texts[0].get_text() for axes in figure.axes]
-    titles = [axes.get_title() for axes in figure.axes]
-    assert labels == [
+    assert texts_of(figure) == [
         "a, 10.0° apart",
         "rotation error 1.2°",
         "b, 20.0° apart",
         "rotation error 30.0°",
     ]
-    assert titles == ["before (centred)", "by fps", "", ""]
+    assert titles_of(figure) == ["before (centred)", "by fps", "", ""]
 
 
 def test_pair_grid_frames_source_and_target(pairs):
@@ -80,8 +102,10 @@ def test_pair_grid_frames_source_and_target(pairs):
 
     figure = pair_grid(source, far, [10.0, 20.0], {"fps": result}, ["a", "b"])
 
-    low, high = figure.axes[2].get_xlim()
-    x = torch.cat([source[1, :, 0], far[1, :, 0]])
+    before = figure.axes[2]  # of the second pair
+    low, high = before.get_xlim()
+    drawn = torch.cat([source[1], far[1]])
+    x = drawn[:, 0]
     assert low < x.min()
     assert high > x.max()
 
@@ -89,53 +113,64 @@ def test_pair_grid_frames_source_and_target(pairs):
 def test_reconstruction_grid_draws_every_cloud_with_its_own_results(randn):
     points = randn(2, 30, 3)
     full = randn(2, 30, 3)
-    result = ReconstructionResult(points[:, :6], randn(2, 25, 3), [1.5, 2.5])
+    sample = points[:, :6]
+    from_sample = randn(2, 25, 3)
+    result = ReconstructionResult(sample, from_sample, [1.5, 2.5])
 
     figure = reconstruction_grid(points, full, {"fps": result}, ["a", "b"])
 
     assert len(figure.axes) == 8
     # Of the second cloud: the input and its reconstruction, then those of the sample.
-    cloud, from_all, samples, reconstruction = figure.axes[4:]
+    cloud, reconstruction, sampled, reconstruction_from_sample = figure.axes[4:]
+    faint, marked = sampled.collections
     assert_draws(cloud.collections[0], points[1])
-    assert_draws(from_all.collections[0], full[1])
-    assert_draws(samples.collections[0], points[1])
-    assert_draws(samples.collections[1], result.samples[1])
-    assert_draws(reconstruction.collections[0], result.points[1])
-    assert samples.texts[0].get_text() == "6 points"
-    assert reconstruction.texts[0].get_text() == "NRE 2.50"
+    assert_draws(reconstruction.collections[0], full[1])
+    assert_draws(faint, points[1])
+    assert_draws(marked, sample[1])
+    assert_draws(reconstruction_from_sample.collections[0], from_sample[1])
+    assert text_of(sampled) == "6 points"
+    assert text_of(reconstruction_from_sample) == "NRE 2.50"
 
 
 def test_reconstructions_are_coloured_by_depth_and_framed_as_their_clouds(randn):
     points = randn(1, 30, 3)
     full = 5 * points
-    result = ReconstructionResult(points[:, :6], full, [1.5])
+    sample = points[:, :6]
+    result = ReconstructionResult(sample, full, [1.5])
 
     figure = reconstruction_grid(points, full, {"fps": result}, ["a"])
 
-    cloud, from_all, *_ = figure.axes
-    depth = np.asarray(from_all.collections[0].get_array())
-    np.testing.assert_allclose(depth, -full[0, :, 2])
-    assert from_all.get_xlim() == cloud.get_xlim()
+    cloud, reconstruction, *_ = figure.axes
+    depth = drawn_values(reconstruction.collections[0])
+    z = full[0, :, 2]
+    np.testing.assert_allclose(depth, -z)
+    assert reconstruction.get_xlim() == cloud.get_xlim()
 
 
 def test_part_grid_colours_every_cloud_by_its_own_parts_on_one_scale(randn):
     points = randn(2, 4, 3)
-    true = torch.tensor([[0, 1, 2, 0], [2, 2, 1, -1]])
-    found = torch.tensor([[0, 0, 0, 0], [1, 1, 1, 3]])
+    true_of_first = [0, 1, 2, 0]
+    true_of_second = [2, 2, 1, -1]
+    found_of_first = [0, 0, 0, 0]
+    found_of_second = [1, 1, 1, 3]
+    sets = {
+        "true": torch.tensor([true_of_first, true_of_second]),
+        "found": torch.tensor([found_of_first, found_of_second]),
+    }
 
-    figure = part_grid(points, {"true": true, "found": found}, ["a", "b"])
+    figure = part_grid(points, sets, ["a", "b"])
 
-    of_second = figure.axes[2:]
-    for axes, parts in zip(of_second, (true, found), strict=True):
-        (collection,) = axes.collections
-        assert_draws(collection, points[1])
-        drawn = np.asarray(collection.get_array())
-        assert drawn.tolist() == parts[1].tolist()
-        assert collection.get_clim() == (0, 3)
-    titles = [axes.get_title() for axes in figure.axes]
-    labels = [axes.texts[0].get_text() for axes in figure.axes]
-    assert titles == ["true", "found", "", ""]
-    assert labels == ["a", "", "b", ""]
+    axes_of_true, axes_of_found = figure.axes[2:]  # of the second cloud
+    (true,) = axes_of_true.collections
+    (found,) = axes_of_found.collections
+    assert_draws(true, points[1])
+    assert_draws(found, points[1])
+    assert drawn_values(true).tolist() == true_of_second
+    assert drawn_values(found).tolist() == found_of_second
+    assert true.get_clim() == (0, 3)
+    assert found.get_clim() == (0, 3)
+    assert titles_of(figure) == ["true", "found", "", ""]
+    assert texts_of(figure) == ["a", "", "b", ""]
 
 
 def test_cloud_grid_draws_the_samples_of_every_cloud(randn):
@@ -144,18 +179,23 @@ def test_cloud_grid_draws_the_samples_of_every_cloud(randn):
 
     figure = figures.cloud_grid(points, {"matched": sample}, ["a", "b"], channel=3)
 
-    whole, sampled = figure.axes[2:]
+    whole, sampled = figure.axes[2:]  # of the second cloud
     faint, marked = sampled.collections
-    assert_draws(whole.collections[0], points[1, :, :3])
-    assert_draws(faint, points[1, :, :3])
-    assert_draws(marked, sample[1, :, :3])
-    colours = figures.colours_by_channel(3, {"input": points, "matched": sample})
-    first_colour = tuple(colours["matched"][1, 0])
-    assert colour_of(marked) == pytest.approx(first_colour)
+    second_cloud = points[1, :, :3]
+    second_sample = sample[1, :, :3]
+    assert_draws(whole.collections[0], second_cloud)
+    assert_draws(faint, second_cloud)
+    assert_draws(marked, second_sample)
+    sets = {"input": points, "matched": sample}
+    colours = figures.colours_by_channel(3, sets)
+    first_colour = colours["matched"][1, 0]
+    assert colour_of(marked) == pytest.approx(tuple(first_colour))
 
 
 def test_clouds_are_drawn_with_one_scale_on_all_axes():
-    points = torch.tensor([[[0.0, 0, 0], [8, 1, 2]]])
+    low = [0.0, 0.0, 0.0]
+    high = [8.0, 1.0, 2.0]
+    points = torch.tensor([[low, high]])
 
     figure = figures.cloud_grid(points, {}, [""])
 
@@ -176,22 +216,28 @@ def test_clouds_are_drawn_with_one_scale_on_all_axes():
 )
 def test_markers_of_many_samples_shrink_to_a_least_size(number, area, rand):
     points = rand(1, 6000, 3)
+    sample = points[:, :number]
 
-    figure = figures.cloud_grid(points, {"matched": points[:, :number]}, [""])
+    figure = figures.cloud_grid(points, {"matched": sample}, [""])
 
-    axes: Any = figure.axes[1]
-    _, marked = axes.collections
-    assert marked.get_sizes().tolist() == [area]
+    sampled: Any = figure.axes[1]
+    _, marked = sampled.collections
+    sizes = marked.get_sizes()
+    assert sizes.tolist() == [area]
 
 
 def test_colours_leave_out_the_most_extreme_hundredth_at_both_ends():
+    values = torch.arange(201.0)
+    values[200] = 1e6
     points = torch.zeros(1, 201, 4)
-    points[0, :, 3] = torch.arange(201)
-    points[0, 200, 3] = 1e6
+    points[0, :, 3] = values
 
-    colours = figures.colours_by_channel(3, {"input": points})["input"][0]
+    colours_of_sets = figures.colours_by_channel(3, {"input": points})
 
-    np.testing.assert_array_equal(colours[0], colours[2])
-    assert (colours[2] != colours[4]).any()
-    np.testing.assert_array_equal(colours[198], colours[200])
-    assert (colours[196] != colours[198]).any()
+    (colours,) = colours_of_sets["input"]
+    lowest, at_low_limit, above_low_limit = colours[[0, 2, 4]]
+    below_high_limit, at_high_limit, highest = colours[[196, 198, 200]]
+    np.testing.assert_array_equal(lowest, at_low_limit)
+    assert (at_low_limit != above_low_limit).any()
+    np.testing.assert_array_equal(at_high_limit, highest)
+    assert (below_high_limit != at_high_limit).any()
