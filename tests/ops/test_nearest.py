@@ -16,7 +16,11 @@ from tests.support.plain import plain_nearest
 @pytest.fixture
 def without_compiled_loops(monkeypatch):
     """Leave the search to torch."""
-    monkeypatch.setattr(compiled, "nearest", lambda *_: None)
+
+    def no_result(*_):
+        return None
+
+    monkeypatch.setattr(compiled, "nearest", no_result)
 
 
 def check_against_double_loop(n, dtype, rng):
@@ -91,13 +95,15 @@ def test_nearest_far_from_origin_has_no_cancellation(cloud, offset, randn, rand)
     exact_queries = queries[cloud].double().numpy()
     smallest, _ = cKDTree(exact_points).query(exact_queries)
     nearest_points = exact_points[indices[cloud]]
-    exact = np.linalg.norm(exact_queries - nearest_points, axis=1)
-    found = distances[cloud].double().sqrt()
+    offsets = exact_queries - nearest_points
+    exact = np.linalg.norm(offsets, axis=1)
+    squares = distances[cloud].double()
+    returned = squares.sqrt().numpy()
     assert exact == pytest.approx(smallest, rel=1e-6)
-    assert found.numpy() == pytest.approx(exact, rel=1e-5)
+    assert returned == pytest.approx(exact, rel=1e-5)
 
 
-@pytest.mark.parametrize("value", [float("inf"), -float("inf"), float("nan")])
+@pytest.mark.parametrize("value", [torch.inf, -torch.inf, torch.nan])
 def test_nearest_of_query_that_is_not_finite_is_a_row(value, randn):
     points = randn(1, 33, 3)
     queries = points[:, :5] + 0.01
@@ -107,8 +113,10 @@ def test_nearest_of_query_that_is_not_finite_is_a_row(value, randn):
     distances, indices = nearest(queries, points)
     _, near_indices = k_nearest(queries, points, 3)
 
-    assert not distances[0, 2].isfinite()
-    assert indices[0, finite].tolist() == finite
+    is_finite = distances[0].isfinite().tolist()
+    rows = indices[0, finite].tolist()
+    assert is_finite == [True, True, False, True, True]
+    assert rows == finite
     assert near_indices.max() < 33
 
 
@@ -120,8 +128,14 @@ def test_nearest_of_query_that_is_not_finite_is_a_row(value, randn):
     ],
 )
 def test_nearest_of_ties_is_lowest_index(query, row):
-    four = torch.tensor([[[1.0, 0, 0], [0, 1, 0], [0, 0, 0], [0, 0, 0]]])
-    points = four.repeat(1, 20, 1)
+    four_points = [
+        [1.0, 0.0, 0.0],
+        [0.0, 1.0, 0.0],
+        [0.0, 0.0, 0.0],
+        [0.0, 0.0, 0.0],
+    ]
+    twenty_times = 20 * four_points
+    points = torch.tensor([twenty_times])
     queries = torch.tensor([[query]])
 
     _, indices = nearest(queries, points)
@@ -135,28 +149,36 @@ def test_nearest_half_precision_compares_in_float32(randn):
 
     distances, indices = nearest(queries, points)
 
-    _, expected = nearest(queries.float(), points.float())
+    queries_in_single = queries.float()
+    points_in_single = points.float()
+    _, expected = nearest(queries_in_single, points_in_single)
     assert distances.dtype == torch.half
     assert torch.equal(indices, expected)
 
 
 MISMATCHES = [
-    ((1, 4, 3), (2, 5, 3)),
-    ((1, 4, 2), (1, 5, 3)),
-    ((1, 4, 3), (1, 0, 3)),
+    pytest.param((1, 4, 3), (2, 5, 3), id="other-number-of-clouds"),
+    pytest.param((1, 4, 2), (1, 5, 3), id="two-coordinates"),
+    pytest.param((1, 4, 3), (1, 0, 3), id="no-points"),
 ]
 
 
-@pytest.mark.parametrize(("queries", "points"), MISMATCHES)
-def test_nearest_shape_mismatch_raises(queries, points):
+@pytest.mark.parametrize(("shape_of_queries", "shape_of_points"), MISMATCHES)
+def test_nearest_shape_mismatch_raises(shape_of_queries, shape_of_points):
+    queries = torch.zeros(shape_of_queries)
+    points = torch.zeros(shape_of_points)
+
     with pytest.raises(UserError, match="points"):
-        nearest(torch.zeros(queries), torch.zeros(points))
+        nearest(queries, points)
 
 
-@pytest.mark.parametrize(("queries", "points"), MISMATCHES)
-def test_k_nearest_shape_mismatch_raises(queries, points):
+@pytest.mark.parametrize(("shape_of_queries", "shape_of_points"), MISMATCHES)
+def test_k_nearest_shape_mismatch_raises(shape_of_queries, shape_of_points):
+    queries = torch.zeros(shape_of_queries)
+    points = torch.zeros(shape_of_points)
+
     with pytest.raises(UserError, match="points"):
-        k_nearest(torch.zeros(queries), torch.zeros(points), 1)
+        k_nearest(queries, points, 1)
 
 
 @pytest.mark.parametrize("k", [1, 4, 30])
@@ -168,8 +190,10 @@ def test_k_nearest_equals_sorted_distances(k, randn):
 
     squared = torch.cdist(queries, points).square()
     in_order, rows = squared.sort(2)
-    assert torch.equal(indices, rows[..., :k])
-    assert_close(distances, in_order[..., :k])
+    expected_distances = in_order[..., :k]
+    expected_indices = rows[..., :k]
+    assert torch.equal(indices, expected_indices)
+    assert_close(distances, expected_distances)
 
 
 @pytest.mark.parametrize("k", [0, 6])
@@ -189,7 +213,15 @@ def plain_chamfer(points, others):
     return from_points.mean(1) + from_others.mean(1)
 
 
-@pytest.mark.parametrize(("n", "m"), [(1, 1), (1, 7), (40, 25), (300, 900)])
+@pytest.mark.parametrize(
+    ("n", "m"),
+    [
+        (1, 1),
+        (1, 7),
+        (40, 25),
+        (300, 900),
+    ],
+)
 def test_chamfer_equals_plain_form(n, m, randn):
     points = randn(3, n, 3, dtype=torch.float64, requires_grad=True)
     others = randn(3, m, 3, dtype=torch.float64, requires_grad=True)
@@ -199,6 +231,8 @@ def test_chamfer_equals_plain_form(n, m, randn):
 
     expected = plain_chamfer(points, others)
     assert_close(distance, expected)
-    gradients = torch.autograd.grad(distance.sum(), inputs)
-    expected_gradients = torch.autograd.grad(expected.sum(), inputs)
-    assert_close(gradients, expected_gradients)
+    sum_of_clouds = distance.sum()
+    expected_sum = expected.sum()
+    gradients_of_sum = torch.autograd.grad(sum_of_clouds, inputs)
+    expected_gradients = torch.autograd.grad(expected_sum, inputs)
+    assert_close(gradients_of_sum, expected_gradients)
