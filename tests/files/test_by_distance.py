@@ -253,6 +253,10 @@ def test_map_of_a_spacing(scan, tmp_path):
         (["--voxel", "10%"], "--voxel must be a number above 0, in the file's unit, such as"),
         (["--spacing", 1, "--space", "zz"], "has no column 'zz'"),
         (["--spacing", 1, "--space", "z=-1"], "--space must be columns with factors of at least 0"),
+        (
+            ["--spacing", 1, "--space", "z=2,z=3"],
+            "--space must be columns with factors of at least",
+        ),
         (["--voxel", 1e-20], "is too small for coordinates"),
         (["--spacing", 1, "--total"], "--total is for --m"),
         (["--m", "0%", "--method", "fps"], "--m must be a whole number of at least 1, or a share"),

@@ -250,6 +250,42 @@ def test_weighted_sums_equal_those_of_gathered_rows_and_so_do_their_gradients(rn
     assert torch.autograd.gradcheck(sums_of, (weights, values))
 
 
+def test_column_weights_of_fixed_points_have_the_same_other_gradients(rng, rand):
+    queries = drawn_normal(rng, 2, 5, 37, requires_grad=True)
+    keys = drawn_normal(rng, 2, 9, 37, requires_grad=True)
+    points = drawn_normal(rng, 2, 9, 3, requires_grad=True)
+    sharpness = rand(2, 5, dtype=torch.float64, requires_grad=True)
+    anchors = torch.randint(9, (2, 5), generator=rng)
+    places = torch.randint(9, (2, 5, 4), generator=rng)
+    given = rand(2, 5, 4, dtype=torch.float64)
+    inputs = (queries, keys, sharpness)
+
+    def gradients(of_points):
+        entries = local_attention.Entries(of_points, anchors, places)
+        weights = local_attention.column_weights(queries, keys, entries, sharpness, 3.0)
+        return torch.autograd.grad(weights, inputs, given)
+
+    of_fixed = gradients(points.detach())
+
+    assert_close(of_fixed, gradients(points), rtol=0, atol=0)
+
+
+def test_weighted_sums_of_fixed_values_have_the_same_gradient_of_weights(rng, rand):
+    weights = rand(2, 5, 4, dtype=DOUBLE, requires_grad=True)
+    values = drawn_normal(rng, 2, 9, 3, requires_grad=True)
+    rows = torch.randint(9, (2, 5, 4), generator=rng)
+    given = drawn_normal(rng, 2, 5, 3)
+
+    def gradient(of_values):
+        sums = local_attention.weighted_sums(weights, rows, of_values)
+        (of_weights,) = torch.autograd.grad(sums, weights, given)
+        return of_weights
+
+    of_fixed = gradient(values.detach())
+
+    assert of_fixed.equal(gradient(values))
+
+
 def test_local_matched_points_are_chosen_from_all_points(rng):
     net = local(m=4, candidates=1, neighbours=1).float().eval()
     points = drawn_normal(rng, 50, 3, dtype=torch.float32)

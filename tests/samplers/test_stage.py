@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from mops_lightning import StageMOPSNet
+from mops_lightning import MOPSNet, StageMOPSNet
 from mops_lightning.errors import UserError
 from mops_lightning.nets.hierarchical import HierarchicalNet, Stage
 from mops_lightning.ops.fps import farthest_point_sample
@@ -39,7 +39,8 @@ def plain_stage(net, points, features, candidates, neighbours):
     order = farthest_order(points[None], 60)[0]
     anchors = points[order[:5]]
     places = points[candidates]
-    near = torch.cdist(anchors, places).argsort(1)[:, :neighbours]
+    in_order = torch.cdist(anchors, places).argsort(1)
+    near = in_order[:, :neighbours]
 
     local = features[candidates]
     hidden = net.rho_local(local) + net.rho_global(local.amax(0))
@@ -54,14 +55,16 @@ def plain_stage(net, points, features, candidates, neighbours):
     widths = unit * net.queries.log_width.exp().square()
     logits = logits - squares / widths
 
-    is_outside = torch.ones_like(logits, dtype=torch.bool).scatter(0, near.T, False)
+    everywhere = torch.ones_like(logits, dtype=torch.bool)
+    is_outside = everywhere.scatter(0, near.T, False)
     weights = logits.masked_fill(is_outside, -torch.inf).softmax(0)
     return weights.T @ places
 
 
 @pytest.mark.parametrize("candidates", [None, 3])
 def test_stage_sampler_equals_a_dense_softmax_over_the_host_features(candidates, randn):
-    net = moved(StageMOPSNet(5, 7, key_channels=16, candidates=candidates, neighbours=6)).double()
+    sampler = StageMOPSNet(5, 7, key_channels=16, candidates=candidates, neighbours=6)
+    net = moved(sampler).double()
     points = randn(1, 60, 3, dtype=torch.float64)
     features = randn(1, 60, 7, dtype=torch.float64, requires_grad=True)
     (rows,) = farthest_order(points, 60)
@@ -73,8 +76,9 @@ def test_stage_sampler_equals_a_dense_softmax_over_the_host_features(candidates,
     expected = plain_stage(net, points[0], features[0], rows, neighbours=6)
     assert_close(generated, expected)
     squares = generated.square().sum()
+    expected_squares = expected.square().sum()
     gradient = torch.autograd.grad(squares, features, retain_graph=True)
-    expected_gradient = torch.autograd.grad(expected.square().sum(), features)
+    expected_gradient = torch.autograd.grad(expected_squares, features)
     assert_close(gradient, expected_gradient)
 
 
@@ -131,18 +135,21 @@ def test_hierarchical_net_gives_its_stages_the_distances_to_the_nearest_points(r
 
 @pytest.mark.parametrize("k", [3, 6])
 def test_stage_gathers_the_points_nearest_to_the_anchors(k, randn):
-    net = moved(StageMOPSNet(5, 7, tau_min=1.0, anchor_width=3.0, neighbours=6)).eval()
+    sampler = StageMOPSNet(5, 7, tau_min=1.0, anchor_width=3.0, neighbours=6)
+    net = moved(sampler).eval()
     stage = Stage(net, 5, channels_in=7, channels_out=9, k=k).eval()
     points = randn(2, 60, 3)
     features = randn(2, 60, 7)
 
     centres, _ = stage(points, features)
-    rows = stage._neighbours(net.by_features(points, features, 5), points)
+    output = net.by_features(points, features, 5)
+    rows = stage._neighbours(output, points)
 
-    anchors = gather_points(points, farthest_order(points, 5))
+    anchor_rows = farthest_order(points, 5)
+    anchors = gather_points(points, anchor_rows)
     assert not torch.equal(centres, anchors)
-    expected = torch.cdist(anchors, points).argsort(2)[..., :k]
-    assert rows.equal(expected)
+    in_order = torch.cdist(anchors, points).argsort(2)
+    assert rows.equal(in_order[..., :k])
 
 
 @pytest.mark.parametrize(
@@ -154,7 +161,8 @@ def test_stage_gathers_the_points_nearest_to_the_anchors(k, randn):
     ],
 )
 def test_stage_searches_neighbours_that_its_sampler_does_not_know(settings, randn):
-    net = moved(StageMOPSNet(5, 7, tau_min=1.0, anchor_width=3.0, **settings)).eval()
+    sampler = StageMOPSNet(5, 7, tau_min=1.0, anchor_width=3.0, **settings)
+    net = moved(sampler).eval()
     stage = Stage(net, 5, channels_in=7, channels_out=9, k=4).eval()
     points = randn(2, 60, 3)
     features = randn(2, 60, 7)
@@ -162,8 +170,8 @@ def test_stage_searches_neighbours_that_its_sampler_does_not_know(settings, rand
 
     rows = stage._neighbours(output, points)
 
-    expected = torch.cdist(output.points, points).argsort(2)[..., :4]
-    assert rows.equal(expected)
+    in_order = torch.cdist(output.points, points).argsort(2)
+    assert rows.equal(in_order[..., :4])
 
 
 def test_hierarchical_net_trains_its_stages_through_the_host_features(randn):
@@ -218,6 +226,35 @@ def test_stage_sampler_outside_a_net_is_refused(randn):
 
     with pytest.raises(UserError, match=r"inside a hierarchical net only.*sampler=mops"):
         net(points)
+
+
+def test_stage_sampler_has_no_matrix_without_features(randn):
+    net = StageMOPSNet(5, 7).eval()
+
+    with pytest.raises(UserError, match=r"inside a hierarchical net only.*sampler=mops"):
+        net.sampling_matrix(randn(1, 60, 3))
+
+
+@pytest.mark.parametrize("name", ["channels", "key_channels"])
+def test_stage_sampler_with_no_channels_is_refused(name):
+    sizes = {"channels": 7, "key_channels": 16}
+
+    with pytest.raises(UserError, match=f"^{name} must be at least 1, got 0"):
+        StageMOPSNet(5, **(sizes | {name: 0}))
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16, torch.float64])
+@pytest.mark.parametrize("sampler", [StageMOPSNet, partial(MOPSNet, anchors="fps")])
+def test_hierarchical_net_in_another_type_is_near_single_precision(sampler, dtype, randn):
+    torch.manual_seed(0)
+    net = HierarchicalNet(3, sampler, points=(12, 6), channels=(8, 10, 12), k=4, hidden=8).eval()
+    points = randn(2, 40, 3)
+    expected = net(points)
+
+    logits = net.to(dtype)(points.to(dtype))
+
+    assert logits.dtype == dtype
+    assert_close(logits.float(), expected, atol=0.1, rtol=0)
 
 
 def test_stage_sampler_without_a_host_says_where_it_belongs():

@@ -164,7 +164,7 @@ def carried(output: SampleOutput, points: Tensor, features: Tensor) -> Tensor:
         return gather_points(features, output.indices)
     if output.matrix is not None:
         values = features.to(output.matrix.dtype)
-        return output.matrix.sample(values)
+        return output.matrix.sample(values).to(features)
     _, rows = nearest(output.points, points)
     return gather_points(features, rows)
 

@@ -3,13 +3,15 @@
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from mops_lightning.errors import UserError
+from mops_lightning.errors import UserError, check_at_least
 from mops_lightning.losses.subset import overlap_losses
+from mops_lightning.ops.local_matrix import LocalMatrix
 from mops_lightning.ops.maxima import max_of_points
 from mops_lightning.ops.precision import (
     pointwise_autocast,
     restrict_autocast_to_pointwise,
 )
+from mops_lightning.ops.sampling_matrix import SamplingMatrix
 from mops_lightning.samplers.local import LocalAnchors, Thinned
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.types import SampleOutput
@@ -31,7 +33,7 @@ class StageMOPSNet(MOPSNet):
     ``(B, m, 3)``.
 
     Args:
-        m: largest number of points; of a cloud with fewer points, all are returned.
+        m: largest number of points; where a cloud has fewer, the host takes as many as it has.
         channels: of the host's features; the host gives their number.
         alpha: weight of the subset loss.
         tau_min: temperature at the end of training and in evaluation.
@@ -70,6 +72,7 @@ class StageMOPSNet(MOPSNet):
     ) -> None:
         if channels is None:
             raise UserError(INSIDE_ONLY)
+        check_at_least(1, channels=channels, key_channels=key_channels)
         super().__init__(
             m,
             alpha,
@@ -89,6 +92,10 @@ class StageMOPSNet(MOPSNet):
         self.rho_local = nn.Linear(channels, key_channels)
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
+        """Refuse points without features."""
+        raise UserError(INSIDE_ONLY)
+
+    def sampling_matrix(self, points: Tensor, m: int | None = None) -> SamplingMatrix | LocalMatrix:
         """Refuse points without features."""
         raise UserError(INSIDE_ONLY)
 
