@@ -14,12 +14,13 @@ from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.anchors import SPACING_POINTS
 from mops_lightning.samplers.base import stream_sample
 from mops_lightning.training.recipe.warm_start import copy_tensors
+from tests.support.samplers import ANCHORED, MOPS_LAYERS
 
 
 def small(kind=MOPSNet, m=6, moved=False, **settings):
     torch.manual_seed(0)
-    layers = {"feature_channels": (8, 6), "rho_channels": (12, 10)}
-    net = kind(m, anchors="fps", **(layers | settings))
+    arguments = {**ANCHORED, **settings}
+    net = kind(m, **arguments)
     if moved:
         for weights in net.queries.parameters():
             torch.nn.init.normal_(weights, std=0.5)
@@ -37,10 +38,17 @@ def plain_spacing(points):
     """Return for each cloud the distance that is the unit of the widths of columns."""
     count = min(SPACING_POINTS, points.shape[1])
     rows = farthest(points, count)
+    nearest = distances_to_the_last(points, rows).amin(1)
+    share = count / SPACING_POINTS
+    return nearest * share**0.5
+
+
+def distances_to_the_last(points, rows):
+    """Return the distances from the last of the chosen points to the others."""
     chosen = gather_points(points, rows)
-    to_last = chosen[:, :-1] - chosen[:, -1:]
-    nearest = to_last.norm(dim=2).amin(1)
-    return nearest * (count / SPACING_POINTS) ** 0.5
+    others = chosen[:, :-1]
+    last = chosen[:, -1:]
+    return (others - last).norm(dim=2)
 
 
 def plain_dense(net, points, keys):
@@ -51,25 +59,34 @@ def plain_dense(net, points, keys):
     for cloud, keys_of_cloud, rows_of_cloud, unit in zip(points, keys, rows, units, strict=True):
         columns = []
         for j, row in enumerate(rows_of_cloud):
-            columns.append(plain_column(net, cloud, keys_of_cloud, j, row, unit))
-        clouds.append(torch.stack(columns, 1))
+            column = plain_column(net, cloud, keys_of_cloud, j, row, unit)
+            columns.append(column)
+        matrix = torch.stack(columns, 1)
+        clouds.append(matrix)
     return torch.stack(clouds)
 
 
 def plain_column(net, cloud, keys, j, row, unit):
     """Return column j of S of one cloud, whose anchor is in this row."""
-    relation = net.queries.relation @ keys[row]
-    query = net.queries.slots[j] + relation / keys.shape[1] ** 0.5
-    width = unit * net.queries.log_width[j].exp()
-    squares = (cloud - cloud[row]).square().sum(1)
-    logits = keys @ query - squares / width**2
-    return (logits / net.tau).softmax(0)
+    queries = net.queries
+    anchor = cloud[row]
+    width = unit * queries.log_width[j].exp()
+    key_channels = keys.shape[1]
+    relation = queries.relation @ keys[row]
+    query = queries.slots[j] + relation / key_channels**0.5
+    content = keys @ query
+    offsets = cloud - anchor
+    squares = offsets.square().sum(1)
+    logits = content - squares / width**2
+    scaled = logits / net.tau
+    return scaled.softmax(0)
 
 
 @pytest.mark.parametrize("training", [True, False])
 @pytest.mark.parametrize("number", [20, 90])
 def test_anchors_equal_dense_softmax_of_distances(training, number, randn):
-    net = small(moved=True, tau_min=0.3).double().train(training)
+    net = small(moved=True, tau_min=0.3)
+    net.double().train(training)
     points = randn(3, number, 3, dtype=torch.float64, requires_grad=True)
     direction = randn(3, 6, 3, dtype=torch.float64)
 
@@ -101,10 +118,11 @@ def test_untrained_anchors_are_near_farthest_points(width, m, randn):
     rows = farthest(points, m)
     anchors = gather_points(points, rows)
     apart = (sampled - anchors).norm(dim=2)
-    to_last = anchors[:, :-1] - anchors[:, -1:]
-    spacing = to_last.norm(dim=2).amin(1, keepdim=True)
-    assert (apart < width * spacing).all()
-    assert apart.max() > width * spacing.mean() / 20
+    spacing = distances_to_the_last(points, rows).amin(1, keepdim=True)
+    limit = width * spacing
+    mean_limit = width * spacing.mean()
+    assert (apart < limit).all()
+    assert apart.max() > mean_limit / 20
 
 
 def test_anchors_are_nested_in_size_and_weights(randn):
@@ -113,14 +131,23 @@ def test_anchors_are_nested_in_size_and_weights(randn):
 
     whole = net(points)
     few = net(points, 5)
-    # More points than a smaller cloud has are not needed for fewer columns.
-    of_small_clouds = net(points[:, :7], 5)
-
     first = whole.first(5)
-    assert_close(few.points, whole.points[:, :5])
-    assert_close(few.matrix.dense(), whole.matrix.dense()[..., :5])
-    assert_close(first.matrix.gram(), few.matrix.gram())
-    assert of_small_clouds.points.shape == (2, 5, 3)
+    first_points = whole.points[:, :5]
+    first_columns = whole.matrix.dense()[..., :5]
+    gram = few.matrix.gram()
+    gram_of_first = first.matrix.gram()
+    assert_close(few.points, first_points)
+    assert_close(few.matrix.dense(), first_columns)
+    assert_close(gram_of_first, gram)
+
+
+def test_anchors_of_clouds_smaller_than_m_give_fewer_columns(randn):
+    points = randn(2, 7, 3)
+    net = small(FMOPSNet, m=16, moved=True).eval()
+
+    sampled = net(points, 5).points
+
+    assert sampled.shape == (2, 5, 3)
 
 
 def test_anchors_of_large_clouds_are_computed_in_blocks(randn, monkeypatch):
@@ -156,37 +183,43 @@ def test_anchors_with_fused_layers_equal_layers(randn):
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_anchors_in_half_precision_keep_distances(dtype, randn):
     points = randn(2, 100, 3).to(dtype)
+    points_in_single = points.float()
     net = small(m=32).eval()
-    net.queries.log_width.data.fill_(-2.0)
-    in_single = net(points.float()).points
+    torch.nn.init.constant_(net.queries.log_width, -2.0)
+    in_single = net(points_in_single).points
+    net_in_half = net.to(dtype)
 
-    in_half = net.to(dtype)(points).points
+    in_half = net_in_half(points).points
 
     assert in_half.dtype == dtype
     assert_close(in_half.float(), in_single, atol=0.05, rtol=0)
 
 
 def test_anchors_warm_start_keeps_their_start():
-    plain = MOPSNet(6, feature_channels=(8, 6), rho_channels=(12, 10))
+    plain = MOPSNet(6, **MOPS_LAYERS)
     larger = small(m=9, moved=True)
+    weights_of_plain = plain.state_dict()
+    weights_of_larger = larger.state_dict()
     net = small()
 
-    copied_from_plain = copy_tensors(plain.state_dict(), net)
-    copied_from_larger = copy_tensors(larger.state_dict(), net)
+    copied_from_plain = copy_tensors(weights_of_plain, net)
+    copied_from_larger = copy_tensors(weights_of_larger, net)
 
+    first_slots = larger.queries.slots[:6]
     assert "rho_local.weight" in copied_from_plain
     for name in copied_from_plain:
         assert not name.startswith("queries")
     assert "queries.slots" in copied_from_larger
-    assert torch.equal(net.queries.slots, larger.queries.slots[:6])
+    assert torch.equal(net.queries.slots, first_slots)
 
 
 def test_anchors_refuse_chunks(randn):
     net = small().eval()
     points = randn(50, 3)
+    chunks = points.split(20)
 
     with pytest.raises(UserError, match=r"needs all points .* chunks.*without anchors=fps"):
-        stream_sample(net, lambda: points.split(20))
+        stream_sample(net, lambda: chunks)
 
 
 def test_columns_keep_their_distances_far_from_the_origin(randn):
@@ -197,29 +230,34 @@ def test_columns_keep_their_distances_far_from_the_origin(randn):
     generated = net(points).points
     generated_far = net(far).points
 
-    assert_close(generated_far - 1000, generated, atol=0.01, rtol=0)
+    moved_back = generated_far - 1000
+    assert_close(moved_back, generated, atol=0.01, rtol=0)
 
 
 def test_columns_of_coincident_points_have_a_least_width():
-    points = torch.zeros(1, 80, 3)
+    points = torch.zeros(1, 80, 3).double()
     points[0, 40:, 0] = 0.002  # two places, 40 points each
-    net = small(m=2, tau_min=1.0).double().eval()
+    net = small(m=2, tau_min=1.0)
+    net.double().eval()
 
-    (generated,) = net(points.double()).points
+    (generated,) = net(points).points
 
     # Weights fall off by exp(−d²/s²) with s = 0.001.
     weight = math.exp(-4)
     share_of_other_place = weight / (1 + weight)
     low = 0.002 * share_of_other_place
     high = 0.002 - low
-    assert sorted(generated[:, 0].tolist()) == pytest.approx([low, high], rel=1e-4)
+    x_in_order = sorted(generated[:, 0].tolist())
+    assert x_in_order == pytest.approx([low, high], rel=1e-4)
 
 
 def median_width(net, points):
     """Return the median over columns of the standard deviation around their means."""
-    columns = net(points).matrix.dense().detach()
+    matrix = net(points).matrix
+    columns = matrix.dense().detach()
     means = columns.mT @ points
-    squares = (points[:, :, None] - means[:, None]).square().sum(3)
+    offsets = points[:, :, None] - means[:, None]
+    squares = offsets.square().sum(3)
     variances = (columns * squares).sum(1)
     return variances.sqrt().median()
 
