@@ -67,13 +67,14 @@ def _check_inner_keys(arguments: Sequence[str], groups: list[str]) -> None:
     given = [override for override in overrides if override is not None]
     if any(_may_bring_keys(override, groups) for override in given):
         return
+    known = keys_of_files() | settings.declared().keys()
     for override in given:
         parts = override.key_or_group.split(".")
         if parts[0] == "hydra" or not _is_change(override):
             continue
         for depth, part in enumerate(parts, 1):
             is_index = part.isdecimal()
-            if not is_index and part not in keys_of_files():
+            if not is_index and part not in known:
                 raise UserError(no_such_setting(".".join(parts[:depth]), arguments))
 
 

@@ -53,8 +53,8 @@ def is_choice(group: str, name: str) -> bool:
 
 @cache
 def keys_of_files() -> frozenset[str]:
-    """Return all keys, at any depth, that the files of ``conf/`` and the declaration set."""
-    keys = set(settings.declared())
+    """Return all keys, at any depth, that the files of ``conf/`` set."""
+    keys: set[str] = set()
     for path in conf_dir().rglob("*.yaml"):
         keys.update(KEY.findall(path.read_text(encoding="utf-8")))
     return frozenset(keys)
