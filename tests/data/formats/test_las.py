@@ -114,6 +114,27 @@ def test_las_arrays_and_extended_records_are_kept(tmp_path):
     assert record.string == "WKT"
 
 
+def test_las_extra_dimensions_are_read_with_their_scales_and_offsets(tmp_path):
+    source = tmp_path / "a.las"
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    one = {"scales": np.array([0.5]), "offsets": np.array([100.0])}
+    two = {"scales": np.array([0.5, 0.25]), "offsets": np.array([100.0, -8.0])}
+    header.add_extra_dim(laspy.ExtraBytesParams("depth", "i2", **one))
+    header.add_extra_dim(laspy.ExtraBytesParams("pair", "2i2", **two))
+    cloud = las_cloud(header, 3)
+    cloud["depth"] = np.array([100.5, 101.0, 99.5])
+    cloud["pair"] = np.array([[100.5, -7.75], [101.0, -8.0], [99.0, -9.0]])
+    cloud.write(source)
+
+    whole = contents(source)
+    by_rows = open_cloud_file(source).read(range(3))
+
+    for table in (whole, by_rows):
+        assert table.columns["depth"].tolist() == [100.5, 101.0, 99.5]
+        assert table.columns["pair_0"].tolist() == [100.5, 101.0, 99.0]
+        assert table.columns["pair_1"].tolist() == [-7.75, -8.0, -9.0]
+
+
 def test_copc_is_written_to_las_without_its_index(scan, tmp_path):
     write(tmp_path / "a.las", contents(scan))
 
