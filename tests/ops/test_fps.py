@@ -1,7 +1,9 @@
+import numpy as np
 import pytest
 import torch
 
 from mops_lightning.errors import UserError
+from mops_lightning.ops.farthest import squared_factors
 from mops_lightning.ops.fps import farthest_point_fill, farthest_point_sample
 from tests.support.plain import plain_farthest
 
@@ -157,3 +159,22 @@ def test_fill_of_points_with_gradients_equals_fill_without(randn):
 
     expected = farthest_point_fill(points, indices, given)
     assert torch.equal(filled, expected)
+
+
+def test_fps_weights_multiply_distances_not_their_squares():
+    points = torch.tensor([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]])
+    weight = torch.tensor([[1.0, 3.0, 1.0]])  # 3 · 1 > 1 · 2, but 3 · 1² < 1 · 2²
+    start = torch.tensor([0])
+
+    rows = farthest_point_sample(points, 2, start, weight=weight)
+
+    assert rows.tolist() == [[0, 1]]
+
+
+def test_factors_of_squared_distances_are_as_squared_weights():
+    weight = np.array([[1.0, 3.0, 2.0]])
+
+    factors = squared_factors(weight)
+
+    ratios = factors / factors[:, :1]
+    np.testing.assert_allclose(ratios, [[1.0, 9.0, 4.0]], rtol=1e-12)
