@@ -36,3 +36,14 @@ def test_max_of_points_passes_on_what_is_not_a_number():
 
     assert largest[0, 0].isnan()
     assert largest[0, 1] == 3.0
+
+
+def test_max_of_points_on_a_cpu_ignores_the_default_device():
+    features = torch.tensor([[[1.0], [2.0]]])
+    torch.set_default_device("meta")
+    try:
+        largest = max_of_points(features)
+    finally:
+        torch.set_default_device(None)
+
+    assert largest.tolist() == [[2.0]]

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 from mops_lightning.config import settings
 from mops_lightning.config.declaration import Setting
 from mops_lightning.config.explain import no_such_setting
-from mops_lightning.config.groups import choice_groups, is_choice, keys_of_files
+from mops_lightning.config.groups import choice_groups, has_choice, keys_of_files
 from mops_lightning.config.overrides import key as key_of
 from mops_lightning.config.overrides import parse_override
 from mops_lightning.errors import UserError
@@ -88,7 +88,7 @@ def _may_bring_keys(override: "Override", groups: list[str]) -> bool:
         return False
     value: Any = override.value()
     if name in groups:
-        return not is_choice(name, str(value))
+        return not has_choice(name, str(value))
     return isinstance(value, dict)
 
 

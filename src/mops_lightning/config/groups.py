@@ -46,8 +46,8 @@ def is_offered(group: str) -> bool:
     return is_named and not (conf_dir() / f"{group}.yaml").is_file()
 
 
-def is_choice(group: str, name: str) -> bool:
-    """Return whether a file of ``conf/`` describes a choice of a group."""
+def has_choice(group: str, name: str) -> bool:
+    """Return whether a file of ``conf/`` describes the choice ``name`` of a group."""
     return (conf_dir() / group / f"{name}.yaml").is_file()
 
 

@@ -20,7 +20,7 @@ def max_of_points(features: Tensor) -> Tensor:
     is_eager = not torch.compiler.is_compiling() and not torch.compiler.is_exporting()
     if is_eager:
         clouds, n, _ = features.shape
-        rows = torch.arange(n).expand(clouds, 1, n)
+        rows = torch.arange(n, device=features.device).expand(clouds, 1, n)
         winners = compiled.winners(features, rows)
         if winners is not None:
             return features.gather(1, winners)[:, 0]

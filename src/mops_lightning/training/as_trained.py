@@ -68,13 +68,13 @@ def lost_baselines(cfg: DictConfig, trained: TrainedRun, arguments: list[str]) -
         trained: the run.
         arguments: the overrides of the evaluation.
     """
-    if trained.trained_task_net or any(is_of_baselines(argument) for argument in arguments):
+    if trained.trained_task_net or any(_is_of_baselines(argument) for argument in arguments):
         return []
     known = trained.record.config.get("baselines") or {}
     return [name for name in known if name not in (cfg.baselines or {})]
 
 
-def is_of_baselines(argument: str) -> bool:
+def _is_of_baselines(argument: str) -> bool:
     """Return whether an override changes the baselines."""
     return overrides.path(argument).partition(".")[0] == "baselines"
 
