@@ -135,9 +135,22 @@ def timed_error(
     began = time.process_time()
     found = align(target, source, start, registration, max_distance)
     seconds = time.process_time() - began
+    degrees, shift = pose_difference(found, truth, centre)
+    return PoseError(degrees, shift, seconds)
+
+
+def pose_difference(found: Points, truth: Points, centre: Points) -> tuple[float, float]:
+    """Return the angle between two rotations in degrees, and how far the poses move a place apart.
+
+    Args:
+        found: ``(4, 4)`` a pose.
+        truth: ``(4, 4)`` another.
+        centre: ``(3,)`` the place. The origin may be kilometres from a scan in map coordinates,
+            where the smallest angle moves it far.
+    """
     rotation = found[:3, :3]
     true_rotation = truth[:3, :3]
     turn = Rotation.from_matrix(rotation.T @ true_rotation)
     degrees = float(np.degrees(turn.magnitude()))
     apart = (rotation - true_rotation) @ centre + found[:3, 3] - truth[:3, 3]
-    return PoseError(degrees, float(np.linalg.norm(apart)), seconds)
+    return degrees, float(np.linalg.norm(apart))
