@@ -54,9 +54,10 @@ def test_normalize_centres_and_scales(dtype, randn):
     assert_close(ratios, ratio_of_cloud, rtol=1e-3, atol=0)
 
 
-def test_normalize_of_coincident_points_is_zero(randn):
-    points = torch.full((2, 10, 3), 0.1)
-    points[1] = randn(10, 3)
+@pytest.mark.parametrize("number", [10, 100, 1000])
+def test_normalize_of_coincident_points_is_zero(number, randn):
+    points = torch.full((2, number, 3), 0.7)  # most of these means are not 0.7
+    points[1] = randn(number, 3)
     points.requires_grad_()
 
     result = normalize_unit_sphere(points)
