@@ -2,9 +2,10 @@ import pytest
 import torch
 
 from mops_lightning.errors import UserError
+from mops_lightning.ops import compiled
 from mops_lightning.ops.fps import farthest_point_sample
 from mops_lightning.samplers.fps import FPSSampler
-from mops_lightning.samplers.ordering import seeded_order
+from mops_lightning.samplers.ordering import point_hashes, seeded_order
 from tests.support.plain import plain_farthest
 
 
@@ -16,6 +17,35 @@ def test_fps_sampler_equals_double_loop(randn):
     first_rows = seeded_order(points, 5)[:, 0].tolist()
     for cloud, first, rows in zip(points, first_rows, indices, strict=True):
         assert rows.tolist() == plain_farthest(cloud, [first], 12)
+
+
+def plain_rows_among_copies(cloud, hashes, m):
+    """The point farthest from the chosen ones; the lowest hash, then row wins a tie."""
+    rows = [min(range(len(cloud)), key=lambda row: (hashes[row], row))]
+    while len(rows) < m:
+        distances = (cloud[:, None] - cloud[rows]).square().sum(2).amin(1).tolist()
+        left = set(range(len(cloud))) - set(rows)
+        rows.append(min(left, key=lambda row: (-distances[row], hashes[row], row)))
+    return rows
+
+
+@pytest.mark.parametrize("start", [None, "farthest"])
+def test_fps_sampler_orders_ties_and_copies_by_hash_then_row_on_every_device(
+    start, rng, monkeypatch
+):
+    points = torch.randint(0, 3, (4, 60, 3), generator=rng).float()  # at most 27 different points
+
+    rows = FPSSampler(60, seed=3, start=start)(points).indices
+
+    with monkeypatch.context() as patch:
+        patch.setattr(compiled, "farthest_from_start", lambda *_: None)
+        patch.setattr(compiled, "farthest", lambda *_: None)
+        rows_in_torch = FPSSampler(60, seed=3, start=start)(points).indices
+    assert torch.equal(rows_in_torch, rows)
+    if start is None:
+        hashes = point_hashes(points, 3).tolist()
+        for cloud, hashes_of_cloud, chosen in zip(points, hashes, rows.tolist(), strict=True):
+            assert chosen == plain_rows_among_copies(cloud, hashes_of_cloud, 60)
 
 
 def test_fps_sampler_uses_start(randn):

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mops_lightning.ops import kernel_farthest
-from mops_lightning.ops.keys import SeededOrder, seed_word, seeded_keys, unit_spheres
+from mops_lightning.ops.keys import SeededOrder, point_hashes, seed_word, unit_spheres
 
 LEAF = 1024
 """Maximum number of points of a leaf of the tree: more leaves exclude more points, larger ones
@@ -147,13 +147,13 @@ def _squares_from_mean(points: Array) -> NDArray[np.float64]:
 
 
 def _first_of_largest(values: Array, points: Array, order: SeededOrder) -> Rows:
-    """Return the rows ``(B, 1)`` of the largest values; the lowest key wins a tie."""
+    """Return the rows ``(B, 1)`` of the largest values; the lowest hash, then row wins a tie."""
     is_largest = values == values.max(1, keepdims=True)
     if (is_largest.sum(1) == 1).all():
         return is_largest.argmax(1)[:, None]
-    keys = seeded_keys(points, order)
-    last = np.iinfo(keys.dtype).max
-    rows = np.where(is_largest, keys, last).argmin(1)
+    hashes = point_hashes(points, order)
+    last = np.iinfo(hashes.dtype).max
+    rows = np.where(is_largest, hashes, last).argmin(1)
     return rows[:, None]
 
 
@@ -202,8 +202,8 @@ def _fill_with_copies(chosen: Array, reached: int, cloud: Array, order: SeededOr
     left[chosen[:reached]] = False
     copies = np.flatnonzero(left)
     if order is not None:
-        keys = seeded_keys(cloud, order)[0]
-        copies = copies[np.argsort(keys[copies], kind="stable")]
+        hashes = point_hashes(cloud, order)[0]
+        copies = copies[np.argsort(hashes[copies], kind="stable")]
     number = len(chosen) - reached
     chosen[reached:] = copies[:number]
 

@@ -29,7 +29,7 @@ BY_ROW = 0
 BY_KEYS = 1
 BY_KEYS_IN_SPHERE = 2
 """What comes first and wins a tie: the lowest row, or the lowest key of the given points or of
-those in the unit sphere."""
+those in the unit sphere. Copies have one key, the lowest row of them comes first."""
 
 
 @jit_cached_with(kernels, kernel_keys)
@@ -68,7 +68,7 @@ def farthest(points, chosen, counts, factors, ranking, word, channels, leaf):
         ranks = np.empty(0, np.int64)
         rows = chosen[cloud * steps : (cloud + 1) * steps]
         if counts[cloud] == 0:
-            ranks = ranks_of(planes, channels, largest, word, in_sphere, True)
+            ranks = ranks_of(planes, channels, largest, word, in_sphere, False)
             rows[0] = _first_of_lowest(ranks)
             counts[cloud] = 1
         weights = factors
@@ -91,7 +91,7 @@ def _first_of_lowest(ranks):
 @jit
 def _ranks_of_given(points, channels, word, in_sphere):
     planes, largest = to_planes(points, channels)
-    return ranks_of(planes, channels, largest, word, in_sphere, True)
+    return ranks_of(planes, channels, largest, word, in_sphere, False)
 
 
 @jit_inlined

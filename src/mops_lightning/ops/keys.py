@@ -53,12 +53,12 @@ def seeded_keys(points: Array, order: SeededOrder) -> NDArray[np.int64]:
     return keys.reshape(clouds, number)
 
 
-def point_hashes(points: Array, seed: int) -> NDArray[np.int64]:
+def point_hashes(points: Array, order: SeededOrder) -> NDArray[np.int64]:
     """Return the keys ``(B, N)`` of points ``(B, N, C)``, in which copies have the same key."""
     clouds, number, channels = points.shape
     flat = np.ascontiguousarray(points).reshape(-1)
     hashes: NDArray[np.int64] = kernel_keys.keys_of(
-        flat, clouds, channels, seed_word(seed), False, False
+        flat, clouds, channels, seed_word(order.seed), order.in_sphere, False
     )
     return hashes.reshape(clouds, number)
 

@@ -10,7 +10,7 @@ from mops_lightning.ops.fps import farthest
 from mops_lightning.ops.keys import SeededOrder
 from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.samplers.ordering import exact_mean, seeded_keys
+from mops_lightning.samplers.ordering import exact_mean, seeded_hashes
 from mops_lightning.types import SampleOutput
 
 
@@ -21,7 +21,8 @@ class FPSSampler(Sampler):
 
     Flexible and nested. The seeded order of the cloud (see ``ordering``) determines the first point
     and breaks ties, so that the sample depends on the seed and the cloud only: neither on the rest
-    of the batch nor, unless ``start`` is an index, on the order of the points.
+    of the batch nor, unless ``start`` is an index, on the order of the points. Among copies of a
+    point the lowest index comes first.
 
     Args:
         m: largest number of points to return.
@@ -102,7 +103,7 @@ def farthest_rows(
     rows = compiled.farthest_from_start(points, m, order, start, weight)
     if rows is not None:
         return rows
-    keys = seeded_keys(points, seed, in_sphere)
+    keys = seeded_hashes(points, seed, in_sphere)
     if isinstance(start, int):
         first = torch.full((len(points),), start, device=points.device)
     elif start == FARTHEST:
@@ -128,7 +129,7 @@ def _squares_from_mean(points: Tensor) -> Tensor:
 
 
 def _first_of_largest(values: Tensor, keys: Tensor) -> Tensor:
-    """Return the rows ``(B,)`` of the largest values; the lowest key wins a tie."""
+    """Return the rows ``(B,)`` of the largest values; the lowest key, then row wins a tie."""
     is_largest = values == values.amax(1, keepdim=True)
     last = torch.iinfo(keys.dtype).max
     return torch.where(is_largest, keys, last).argmin(1)

@@ -5,6 +5,8 @@ order of its points. Here, points are ordered by a hash of their coordinates, th
 cloud.
 """
 
+from typing import Any
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -44,16 +46,31 @@ def seeded_order(points: Tensor, seed: int, in_sphere: bool = False) -> Tensor:
     return random.argsort(dim=1, stable=True)
 
 
+def seeded_hashes(points: Tensor, seed: int, in_sphere: bool = False) -> Tensor:
+    """Return random keys ``(B, N)`` int64 as ``seeded_keys``, but one key for all copies."""
+    given = points.detach()
+    if given.is_cpu:
+        order = SeededOrder(seed, in_sphere)
+        return torch.from_numpy(keys.point_hashes(numbers_of(given), order))
+    if in_sphere:
+        given = in_unit_sphere(given)
+    return point_hashes(given, seed)
+
+
 def seeded_keys(points: Tensor, seed: int, in_sphere: bool = False) -> Tensor:
     """Return the random keys ``(B, N)`` int64 whose order is ``seeded_order``."""
     given = points.detach()
     if given.is_cpu:
-        numbers = given.to(distance_dtype(given)).numpy()
         order = SeededOrder(seed, in_sphere)
-        return torch.from_numpy(keys.seeded_keys(numbers, order))
+        return torch.from_numpy(keys.seeded_keys(numbers_of(given), order))
     if in_sphere:
         given = in_unit_sphere(given)
     return _keys_on_device(given, seed)
+
+
+def numbers_of(points: Tensor) -> NDArray[Any]:
+    """Return points on a CPU as an array of float32 or float64."""
+    return points.detach().to(distance_dtype(points)).numpy()
 
 
 def _keys_on_device(points: Tensor, seed: int) -> Tensor:
@@ -118,13 +135,6 @@ def smallest(keys: Tensor, m: int) -> Tensor:
     order = np.argsort(keys_of_rows, axis=1)
     ordered_rows = np.take_along_axis(rows, order, 1)
     return torch.from_numpy(ordered_rows)
-
-
-def compiled_hashes(points: Tensor, seed: int) -> NDArray[np.uint64]:
-    """Return the bits of ``point_hashes`` of clouds on a CPU, several times as fast."""
-    given = points.detach()
-    numbers = given.to(distance_dtype(given)).numpy()
-    return keys.point_hashes(numbers, seed).view(np.uint64)
 
 
 def point_hashes(points: Tensor, seed: int) -> Tensor:

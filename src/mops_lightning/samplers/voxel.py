@@ -9,7 +9,7 @@ from mops_lightning.ops import voxel_search
 from mops_lightning.ops.fps import farthest_point_fill
 from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.base import Sampler
-from mops_lightning.samplers.ordering import compiled_hashes, seeded_order
+from mops_lightning.samplers.ordering import seeded_hashes, seeded_order
 from mops_lightning.types import SampleOutput
 
 COARSEST = -1.0
@@ -87,7 +87,7 @@ def fullest_voxels(points: Tensor, m: int) -> list[NDArray[np.int64]]:
     """
     on_cpu = points.detach().cpu()
     exact = on_cpu.double().contiguous().numpy()
-    hashes = compiled_hashes(on_cpu, 0).view(np.int64)
+    hashes = seeded_hashes(on_cpu, 0).numpy()
     spans = _spans(on_cpu)
     scales = [_scale(cloud, m) for cloud in spans]
     clouds = zip(exact, spans, scales, hashes, strict=True)
