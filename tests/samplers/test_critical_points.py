@@ -9,6 +9,7 @@ from mops_lightning.errors import UserError
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.critical_points import CriticalSampler
+from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.ordering import seeded_order
 from tests.support.plain import plain_farthest
 
@@ -144,3 +145,15 @@ def test_critical_leaves_modes_of_a_failing_net_as_they_are(randn):
         sampler(randn(2, 40, 3))
 
     assert modes_of(net) == modes
+
+
+def test_critical_without_any_contribution_starts_from_the_first_point_in_seeded_order(randn):
+    points = randn(2, 40, 3)
+    features = torch.zeros(2, 40, 4)
+
+    chosen = CriticalSampler(5, seed=3).by_features(points, features, 5)
+
+    expected = FPSSampler(5, seed=3)(points)
+    assert chosen.indices is not None
+    assert expected.indices is not None
+    assert torch.equal(chosen.indices, expected.indices)

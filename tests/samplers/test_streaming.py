@@ -42,6 +42,18 @@ def test_stream_sample_is_nested(randn):
     assert_close(few, all_points[:5])
 
 
+def test_stream_sample_takes_a_cloud_of_as_many_points_as_it_returns(randn):
+    torch.manual_seed(1)
+    sampler = MOPSNet(8).eval()
+    cloud = randn(8, 3)
+    with torch.no_grad():
+        (whole,) = sampler(cloud[None]).points
+
+    streamed = stream_sample(sampler, lambda: cloud.split(3))
+
+    assert_close(streamed, whole)
+
+
 @pytest.mark.parametrize(
     ("make", "chunks", "message"),
     [

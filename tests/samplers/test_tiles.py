@@ -122,13 +122,32 @@ def test_thin_equals_plain_removal():
     assert rows.tolist() == left
 
 
-def test_thin_equal_points_leaves_m():
+def test_thin_equal_points_leaves_m_with_all_others():
     equal = np.ones((60, 3))
     points = np.concatenate([equal, cloud(4)])
 
-    rows = thin(points, 10)
+    rows = thin(points, 10).tolist()
 
-    assert len(set(rows.tolist())) == 10
+    assert len(set(rows)) == 10
+    assert rows[-4:] == [60, 61, 62, 63]
+
+
+def test_thin_to_few_points_keeps_them_apart():
+    points = cloud(200)
+
+    kept = points[thin(points, 10)]
+
+    distances, _ = cKDTree(kept).query(kept, k=[2])
+    assert len(kept) == 10
+    assert np.min(distances) > 3  # the nearest of ten random points are 1.3 apart on average
+
+
+def test_thin_pairs_of_equal_points_leaves_one_of_each():
+    points = np.repeat(cloud(20), 2, axis=0)
+
+    rows = thin(points, 20)
+
+    assert rows.tolist() == list(range(0, 40, 2))
 
 
 def test_sample_by_tiles_returns_m_different_rows(sampler):
@@ -205,6 +224,30 @@ def test_sample_by_tiles_samples_a_quarter_more_points_than_it_keeps(size, asked
 
     assert sampler.asked == [asked]
     assert len(rows) == 80
+
+
+class Noting(FPSSampler):
+    """Notes the tiles that it gets."""
+
+    def __init__(self, m):
+        super().__init__(m)
+        self.tiles = []
+
+    def select(self, readout, clouds, m, weight=None):
+        self.tiles += clouds
+        return super().select(readout, clouds, m, weight)
+
+
+def test_sample_by_tiles_gives_every_tile_its_own_channels():
+    points = street(500)
+    channels = torch.from_numpy(points[:, :2] / 1000)
+    sampler = Noting(400)
+
+    sample_by_tiles(points, 125, 80, sampler, channels)
+
+    assert len(sampler.tiles) == 4
+    for tile in sampler.tiles:
+        assert torch.equal(tile[:, 3:], tile[:, :2] / 1000)
 
 
 def test_sample_by_tiles_all_points_and_too_many(sampler):

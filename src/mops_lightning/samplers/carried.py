@@ -25,8 +25,6 @@ def with_carried(output: SampleOutput, points: Tensor) -> SampleOutput:
         return output
     rows = output.indices
     if rows is None:
-        places = coordinates(points).to(sampled.dtype)
-        _, rows = nearest(sampled, places)
+        _, rows = nearest(sampled, coordinates(points))
     channels = gather_points(points[..., 3:], rows)
-    columns = [sampled, channels.to(sampled.dtype)]
-    return output._replace(points=torch.cat(columns, -1))
+    return output._replace(points=torch.cat([sampled, channels], -1))

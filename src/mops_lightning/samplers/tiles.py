@@ -179,9 +179,32 @@ def thin(points: Points, m: int) -> Rows:
     Returns:
         ``(m,)`` rows, ascending.
     """
-    excess = len(points) - m
-    if not excess:
-        return np.arange(m)
+    rows = _with_fewest_copies(points, m)
+    while len(rows) > m:
+        rows = rows[_remove_near(points[rows], len(rows) - m)]
+    return rows
+
+
+def _with_fewest_copies(points: Points, m: int) -> Rows:
+    """Return the first row of equal points and, where these are fewer than m, rows of copies."""
+    _, first_rows = np.unique(points, axis=0, return_index=True)
+    is_first = np.zeros(len(points), bool)
+    is_first[first_rows] = True
+    copies = np.flatnonzero(~is_first)
+    number_of_copies = max(m - len(first_rows), 0)
+    is_first[copies[:number_of_copies]] = True
+    return np.flatnonzero(is_first)
+
+
+def _remove_near(points: Points, excess: int) -> Rows:
+    """Remove one of the nearest two of different points, ``excess`` points at most.
+
+    Every point is compared with its nearest ones only. Once all of these are removed, it may stay
+    though another one is near.
+
+    Returns:
+        The rows that remain, ascending.
+    """
     tree = cKDTree(points)
     nearest: Any = tree.query(points, k=min(NEIGHBOURS + 1, len(points)))
     distance, other = nearest
@@ -197,7 +220,4 @@ def thin(points: Points, m: int) -> Rows:
         if remains[row] and remains[neighbour]:
             remains[max(row, neighbour)] = False
             excess -= 1
-    kept = np.flatnonzero(remains)
-    # Too many remain only where many points are equal.
-    farthest_last = distance[kept, 1].argsort(kind="stable")
-    return np.sort(kept[farthest_last[excess:]])
+    return np.flatnonzero(remains)
