@@ -202,6 +202,20 @@ def test_space_makes_a_column_count(method, clouds, tmp_path):
     assert abs(first - second) >= 290
 
 
+@pytest.mark.parametrize("method", ["fps", "poisson"])
+@pytest.mark.parametrize("extra", [["--seed", 3], ["--weight", "row"]])
+def test_space_of_the_coordinates_alone_keeps_the_points_of_no_space(
+    extra, method, clouds, tmp_path
+):
+    settings = ["--method", method, "--m", 20, *extra]
+
+    done(clouds / "c.ply", tmp_path / "plain.ply", *settings)
+    done(clouds / "c.ply", tmp_path / "in_space.ply", *settings, "--space", "x")
+
+    plain = contents(tmp_path / "plain.ply").columns["row"].tolist()
+    assert contents(tmp_path / "in_space.ply").columns["row"].tolist() == plain
+
+
 def test_space_with_another_column_keeps_all_coordinates(tmp_path):
     source = tmp_path / "in.ply"
     small = tmp_path / "out.ply"

@@ -6,6 +6,7 @@ from typing import Any
 import laspy
 import numpy as np
 import pytest
+from laspy.vlrs.vlrlist import VLRList
 from numpy.testing import assert_allclose, assert_array_equal
 
 from mops_lightning.data.formats.registry import read
@@ -37,6 +38,7 @@ def scan(tmp_path_factory):
         "row": np.arange(900, dtype=np.int32),
         "red": RNG.integers(0, 256, 900).astype(np.uint8),
         "heat": RNG.normal(size=900) * 1e9,
+        "hole": np.where(np.arange(900) == 7, np.nan, 1.0),
         "nx": normals[:, 0],
         "ny": normals[:, 1],
         "nz": normals[:, 2],
@@ -106,14 +108,15 @@ def test_chunks_and_tiles_equal_one_pass(budget, scan, tmp_path):
             assert_array_equal(part.columns[column], values)
 
 
-def test_spacing_keeps_rows_of_the_op(scan, tmp_path):
+@pytest.mark.parametrize("seed", [0, 3])
+def test_spacing_keeps_rows_of_the_op(seed, scan, tmp_path):
     result = tmp_path / "out.npz"
 
-    out = done(scan, result, "--spacing", 0.7)
+    out = done(scan, result, "--spacing", 0.7, "--seed", seed)
 
     kept = contents(result)
     whole = contents(scan).finite()
-    rows = keep_spaced(whole.points, 0.7)
+    rows = keep_spaced(whole.points, 0.7, seed)
     assert_array_equal(kept.points, whole.points[rows])
     assert_array_equal(kept.columns["row"], whole.columns["row"][rows])
     assert f"{len(rows)} of 899 points (1 more without finite coordinates left out)" in out
@@ -128,8 +131,10 @@ def test_voxel_keeps_one_row_of_each_and_prints_the_origin(scan, tmp_path):
     whole = contents(scan)
     cells = np.floor(whole.finite().points / 0.8)
     occupied = np.unique(cells, axis=0)
+    rows = kept.columns["row"]
     assert len(kept.points) == len(occupied)
-    assert_array_equal(kept.points, whole.points[kept.columns["row"]])
+    assert_array_equal(kept.points, whole.points[rows])
+    assert_array_equal(rows, np.sort(rows))
     assert "voxels of 0.8 from the origin 0 0 0" in out
 
 
@@ -177,6 +182,35 @@ def test_voxel_means_keep_the_row_of_a_point_of_their_voxel(voxel_means):
     assert_array_equal(voxel[places], np.arange(voxel.max() + 1))
 
 
+@pytest.mark.parametrize("budget", [["--spacing", 0.7], ["--voxel", 0.8]])
+def test_coordinates_alone_are_kept_on_request(budget, scan, tmp_path):
+    done(scan, tmp_path / "out.npz", *budget)
+    done(scan, tmp_path / "bare.npz", *budget, "--weight", "red", "--coordinates-only")
+
+    assert "row" in contents(tmp_path / "out.npz").columns
+    assert not contents(tmp_path / "bare.npz").columns
+
+
+def test_points_outside_of_the_bounds_are_not_said_to_be_broken(scan, tmp_path):
+    bounds = "512345,5412345,512348,5412348"
+    whole = contents(scan).finite().points
+    is_inside = (whole[:, :2] <= [512348, 5412348]).all(1)
+
+    out = done(scan, tmp_path / "out.npz", "--voxel", 0.8, "--bounds", bounds)
+
+    assert f" of {is_inside.sum()} points, voxels of" in out
+
+
+def test_voxel_means_of_float32_have_double_precision(tmp_path):
+    points = np.array([[0.1, 0.2, 0.3], [0.2, 0.4, 0.4]], np.float32)
+    np.save(tmp_path / "in.npy", points)
+
+    done(tmp_path / "in.npy", tmp_path / "out.npy", "--voxel", 1, "--readout", "generated")
+
+    mean = points.astype(np.float64).mean(0)
+    assert_allclose(np.load(tmp_path / "out.npy"), [mean], rtol=1e-12)
+
+
 @pytest.mark.parametrize("chunk", [[], ["--chunk", 2]])
 def test_voxel_mean_of_a_missing_value_is_missing(chunk, tmp_path):
     source = tmp_path / "in.ply"
@@ -190,7 +224,8 @@ def test_voxel_mean_of_a_missing_value_is_missing(chunk, tmp_path):
         ]
     )
     heat = np.array([1.0, np.nan, 3.0, 7.0])
-    write_cloud(source, points, {"heat": heat})
+    cold = np.array([-1e9, -2e9, -3e9, -7e9])
+    write_cloud(source, points, {"heat": heat, "cold": cold})
 
     done(source, result, "--voxel", 1, "--readout", "generated", *chunk)
 
@@ -198,6 +233,7 @@ def test_voxel_mean_of_a_missing_value_is_missing(chunk, tmp_path):
     expected = [[0.2, 0.2, 0.2], [1.5, 0.5, 0.5]]
     assert_allclose(means.points, expected, atol=1e-9)
     assert_array_equal(means.columns["heat"], [np.nan, 7.0])
+    assert_allclose(means.columns["cold"], [-2e9, -7e9], rtol=1e-9)
 
 
 def test_voxel_means_renormalise_normals_by_the_names_of_pcl(tmp_path):
@@ -239,6 +275,16 @@ def test_map_of_a_spacing(scan, tmp_path):
     assert distances.max() < 0.7
 
 
+def test_map_of_fewer_points_than_its_rows_has_all_of_them(tmp_path):
+    points = uniform_points(30, 0)
+    np.save(tmp_path / "in.npy", points)
+    map_ = tmp_path / "map.npz"
+
+    done(tmp_path / "in.npy", tmp_path / "out.npy", "--spacing", 99, "--map", map_, "--map-k", 4)
+
+    assert np.load(map_)["rows"].tolist() == [[0]] * 30
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -252,6 +298,8 @@ def test_map_of_a_spacing(scan, tmp_path):
         (["--spacing", "5cm"], "--spacing must be a number above 0, in the file's unit, such as"),
         (["--voxel", "10%"], "--voxel must be a number above 0, in the file's unit, such as"),
         (["--spacing", 1, "--space", "zz"], "has no column 'zz'"),
+        (["--spacing", 1, "--space", "hole"], "--space: 'hole' of"),
+        (["--spacing", 1, "--weight", "curvature", "--chunk", 99], "leave --chunk out"),
         (["--spacing", 1, "--space", "z=-1"], "--space must be columns with factors of at least 0"),
         (
             ["--spacing", 1, "--space", "z=2,z=3"],
@@ -358,13 +406,26 @@ def test_degrees_told_by_keys_of_geotiff_are_refused(kind, is_refused, tmp_path)
     [
         ('GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]]]', True),
         ('PROJCS["WGS 84 / UTM zone 32N",GEOGCS["WGS 84",DATUM["WGS_1984"]]]', False),
+        ('GEOGCRS["WGS 84",DATUM["World Geodetic System 1984"]]', True),
+        ('PROJCRS["WGS 84 / UTM zone 32N",BASEGEOGCRS["WGS 84"]]', False),
     ],
 )
-@pytest.mark.parametrize("budget", ["--spacing", "--voxel"])
-def test_degrees_are_refused(budget, wkt, is_refused, tmp_path):
+@pytest.mark.parametrize(
+    ("budget", "place"),
+    [
+        ("--spacing", "before the points"),
+        ("--voxel", "before the points"),
+        ("--spacing", "after the points"),
+    ],
+)
+def test_degrees_are_refused(budget, place, wkt, is_refused, tmp_path):
     header = laspy.LasHeader(point_format=6, version="1.4")
     header.scales = np.full(3, 1e-7)
-    header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt))
+    crs = laspy.vlrs.known.WktCoordinateSystemVlr(wkt)
+    if place == "before the points":
+        header.vlrs.append(crs)
+    else:
+        header.evlrs = VLRList([crs])
     las = laspy.LasData(header)
     las.x, las.y, las.z = RNG.uniform(8, 9, (3, 50))
     las.write(tmp_path / "in.las")

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
+from mops_lightning import downsample
 from tests.support.cloud_files import contents
 from tests.support.clouds import uniform_points
 from tests.support.downsample import done, refused
@@ -37,6 +38,20 @@ def test_untrained_method_keeps_rows_of_the_file(method, folder, tmp_path):
     rows = kept.columns["label"].astype(int)
     assert len(set(rows)) == 20
     assert_array_equal(kept.points, whole.points[rows])
+
+
+@pytest.mark.parametrize("method", ["fps", "random"])
+def test_seed_of_a_method_is_that_of_python(method, tmp_path):
+    points = uniform_points(90, 0)
+    np.save(tmp_path / "in.npy", points)
+    settings = ["--method", method, "--m", 7, "--seed", 3]
+
+    done(tmp_path / "in.npy", tmp_path / "out.npy", *settings)
+
+    expected, rows = downsample(points, 7, method, seed=3)
+    _, other_rows = downsample(points, 7, method, seed=0)
+    assert as_set(np.load(tmp_path / "out.npy")) == as_set(expected)
+    assert set(rows.tolist()) != set(other_rows.tolist())
 
 
 def as_set(points):

@@ -92,6 +92,44 @@ def test_downsample_vertices_takes_those_of_a_mesh(suffix, tmp_path):
     assert_allclose(vertices, ball.vertices, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("settings", "points"),
+    [
+        (["--m", 5, "--surface", 60], "5 of 60 points"),
+        (["--m", 5], "5 of 10,000 points"),
+        (["--m", 1300], "1,300 of 10,400 points"),
+        (["--m", "1%"], "100 of 10,000 points"),
+        (["--spacing", 99], "1 of 10,000 points"),
+        (["--spacing", 99, "--surface", 60], "1 of 60 points"),
+    ],
+)
+def test_downsample_takes_points_on_the_surface_of_a_mesh(settings, points, tmp_path):
+    path = tmp_path / "a.off"
+    trimesh.creation.box().export(path)
+    if "--m" in settings:
+        settings = [*settings, "--method", "random"]
+
+    out = downsampled(path, tmp_path / "b.npy", *settings)
+
+    assert f"b.npy: {points}, " in out
+    kept = np.load(tmp_path / "b.npy")[:, :3]
+    assert_allclose(np.abs(kept).max(1), 0.5, atol=1e-6)
+
+
+def test_downsample_of_a_mesh_takes_other_points_of_its_surface_by_seed(tmp_path):
+    path = tmp_path / "a.off"
+    trimesh.creation.box().export(path)
+
+    def sampled(name, seed):
+        out = tmp_path / name
+        downsampled(path, out, "--spacing", 0.9, "--seed", seed)
+        return np.load(out).tolist()
+
+    first = sampled("first.npy", 3)
+    assert sampled("again.npy", 3) == first
+    assert sampled("other.npy", 4) != first
+
+
 def test_downsample_vertices_of_a_sampled_surface_is_refused(tmp_path):
     path = tmp_path / "a.ply"
     ball = trimesh.creation.icosphere(subdivisions=2)

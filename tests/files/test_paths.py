@@ -13,7 +13,7 @@ from tests.support.downsample import refused
 @pytest.fixture
 def inputs(tmp_path, monkeypatch):
     """Clouds, a mesh and another file, in the working directory."""
-    for name in ("in/a.npy", "in/deep/b.ply", "in/c.stl", "in/notes.md", "b.npy"):
+    for name in ("in/a.npy", "in/deep/b.ply", "in/c.stl", "in/notes.md", "b.npy", "capital/D.NPY"):
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
@@ -24,7 +24,9 @@ def inputs(tmp_path, monkeypatch):
     ("source", "target", "expected"),
     [
         ("b.npy", "small.ply", ["small.ply"]),
+        ("b.npy", "small.PLY", ["small.PLY"]),
         ("b.npy", "in", ["in/b.npy"]),
+        ("capital", "out", ["out/D.npy"]),
         ("in", "out", ["out/a.npy", "out/c.ply", "out/deep/b.ply"]),
         ("in", "in/deep", ["in/deep/a.npy", "in/deep/c.ply"]),
         ("in/*.npy", "out", ["out/a.npy"]),
@@ -72,5 +74,11 @@ def test_outputs_links_and_temporary_files_are_no_inputs(inputs):
     Path("in/loop.npy").symlink_to("loop.npy")
     Path("in/circle").symlink_to("../in")
     Path(f"in/{TEMPORARY}a-x.npy").touch()
-    found = find_inputs(Path("in"), Path("out")).pairs
-    assert [str(path) for path, _ in found] == ["in/a.npy", "in/c.stl", "in/deep/b.ply"]
+    Path("in/.notes").touch()
+    Path("in/.z.npy").touch()
+
+    found = find_inputs(Path("in"), Path("out"))
+
+    sources = [str(path) for path, _ in found.pairs]
+    assert sources == ["in/.z.npy", "in/a.npy", "in/c.stl", "in/deep/b.ply"]
+    assert found.unreadable == [Path("in/notes.md")]

@@ -312,14 +312,21 @@ def test_colours_are_averaged_on_request(line_files, tmp_path):
     assert red.tolist() == [0, 50, 100, 100, 100]
 
 
-@pytest.mark.parametrize("kind", ["f4", "u4"])
-def test_packed_colours_are_averaged_channel_by_channel(kind, tmp_path):
+@pytest.mark.parametrize(
+    ("kind", "settings"),
+    [
+        ("f4", ["--mean"]),
+        ("u4", ["--mean"]),
+        ("f4", []),
+    ],
+)
+def test_packed_colours_are_averaged_channel_by_channel(kind, settings, tmp_path):
     line = line_of(3)
-    blue_green_red = [
-        [0, 0, 200, 0],
+    blue_green_red_alpha = [
+        [0, 0, 200, 4],
         [100, 2, 0, 0],
     ]
-    bytes_of_colours = np.array(blue_green_red, np.uint8)
+    bytes_of_colours = np.array(blue_green_red_alpha, np.uint8)
     packed = bytes_of_colours.view(f"<{kind}")[:, 0]
     small = tmp_path / "small.pcd"
     big = tmp_path / "big.npz"
@@ -327,13 +334,13 @@ def test_packed_colours_are_averaged_channel_by_channel(kind, tmp_path):
     write_cloud(big, line)
     write_cloud(small, line[[0, 2]], {"rgb": packed})
 
-    done(main, [small, big, out, "--field", "rgb", "--k", 2, "--mean"])
+    done(main, [small, big, out, "--field", "rgb", "--k", 2, *settings])
 
     carried = np.ascontiguousarray(contents(out).columns["rgb"])
     bytes_of_carried = carried.view(np.uint8).reshape(-1, 4)
     assert bytes_of_carried.tolist() == [
-        [0, 0, 200, 0],
-        [50, 1, 100, 0],
+        [0, 0, 200, 4],
+        [50, 1, 100, 2],
         [100, 2, 0, 0],
     ]
 

@@ -59,8 +59,8 @@ def test_grids_run_one_after_the_other_and_win_over_params(plan):
     assert "3 cells: 3 completed; in cells" in out
 
 
-def test_grids_command_line_applies_to_every_grid_and_values_may_be_null_and_lists(tmp_path):
-    grids = "hydra.sweeper.grids=[{sampler:random,sizes:[2,6],weights:null},{sampler:fps}]"
+def test_grids_command_line_wins_over_every_grid_and_values_may_be_null_and_lists(tmp_path):
+    grids = "hydra.sweeper.grids=[{sampler:random,sizes:[2,6],weights:null},{sampler:fps,m:4}]"
     status, cells, out, err = start(tmp_path, "m=2", grids)
     assert status == 0, out + err
     assert cells == ["random-m2", "fps-m2"]

@@ -1,5 +1,7 @@
 import json
 import math
+import shutil
+import subprocess
 from dataclasses import replace
 
 import pytest
@@ -120,12 +122,12 @@ def test_written_record_is_not_edited_and_each_changed_figure_is_noticed(tmp_pat
 def test_record_that_was_moved_or_has_no_digest_is_not_edited(tmp_path):
     path = run_record.write(tmp_path / "run", record())
     plain = json.loads(path.read_text())
-    run_record.write_many(
-        tmp_path / "elsewhere" / "runs.jsonl", [run_record.read(tmp_path / "run")]
-    )
+    found = replace(run_record.read(tmp_path / "run"), folder=str(tmp_path / "run"))
+    run_record.write_many(tmp_path / "elsewhere" / "runs.jsonl", [found])
 
     moved = json.loads((tmp_path / "elsewhere" / "runs.jsonl").read_text())
     assert moved["digest"] == plain["digest"]
+    assert moved["folder"] == "../run"
     assert not run_record.from_plain(moved).is_edited
     whole_seconds = {**plain, "seconds": {"total": 1}}  # equal numbers, written in another way
     assert not run_record.from_plain(whole_seconds).is_edited
@@ -136,3 +138,28 @@ def test_record_that_was_moved_or_has_no_digest_is_not_edited(tmp_path):
     of_earlier_version = {name: value for name, value in plain.items() if name != "digest"}
     of_earlier_version["metrics"] = {"test/generated/accuracy": 0.9}
     assert not run_record.from_plain(of_earlier_version).is_edited
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
+def test_git_state_is_the_commit_and_whether_a_file_of_it_was_changed(tmp_path, monkeypatch):
+    folder = tmp_path / "src" / "mops_lightning" / "records"
+    folder.mkdir(parents=True)
+    code = folder / "run_record.py"
+    code.write_text("first\n")
+    monkeypatch.setattr(run_record, "__file__", str(code))
+    assert run_record.git_state() == {"commit": None, "dirty": None}  # no checkout
+
+    def git(*words):
+        who = ["-c", "user.name=a", "-c", "user.email=a@b"]
+        command = ["git", "-C", str(tmp_path), *who, *words]
+        return subprocess.run(command, check=True, capture_output=True, text=True, timeout=60)
+
+    git("init")
+    git("add", "src")
+    git("commit", "--no-gpg-sign", "-m", "First")
+    commit = git("rev-parse", "HEAD").stdout.strip()
+    (tmp_path / "notes.md").touch()
+    assert run_record.git_state() == {"commit": commit, "dirty": False}
+
+    code.write_text("second\n")
+    assert run_record.git_state() == {"commit": commit, "dirty": True}

@@ -41,11 +41,32 @@ def test_one_size_gives_column_per_metric_and_rows_of_baselines_readouts_full():
     ]
 
 
-def test_columns_follow_declared_order_and_hide_the_rest():
-    metrics = {f"test/{readout}/{name}": 1.5 for readout in ("generated", "full") for name in "abc"}
+def test_columns_follow_declared_order_then_names_and_hide_the_rest():
+    metrics = {}
+    for readout in ("generated", "full"):
+        for name in "dabc":
+            metrics[f"test/{readout}/{name}"] = 1.5
     infos = {"a": {"summary_order": 2}, "b": {"summary_order": None}, "c": {"summary_order": 1}}
+    infos["d"] = {"summary_order": 2}
     text = printed(metrics, "test/generated/c", infos)
-    assert cells(text)[0] == ["sampled by", "c", "a"]
+    assert cells(text)[0] == ["sampled by", "c", "a", "d"]
+
+
+def test_last_line_has_status_time_what_was_left_out_and_files():
+    console = Console(width=80, record=True, file=StringIO())
+    finished = record(
+        seconds={"total": 61.6},
+        partial=["tested on 1 of 4 batches", "trained on 1 of 9"],
+        files={"weights": "z.safetensors", "clouds": "clouds.npz"},
+        metrics={},
+    )
+
+    closing_lines(Path("run"), finished, console)
+
+    assert console.export_text() == (
+        "completed in 62 s, but tested on 1 of 4 batches and trained on 1 of 9; files in run/: "
+        "result.json, clouds.npz, z.safetensors\n"
+    )
 
 
 def test_seven_sizes_fit_eighty_columns():
