@@ -14,6 +14,7 @@ from mops_lightning.data.loader import CloudLoader
 from mops_lightning.errors import UserError
 from mops_lightning.ops.points import UnitSphere
 from mops_lightning.records.run_record import read as read_record
+from mops_lightning.seeding import generator
 from tests.support.command_line import call, done, refused, runs
 
 SIZES = (40, 90, 60, 120, 75, 50, 44, 99)
@@ -194,6 +195,24 @@ def test_loader_draws_other_points_in_every_epoch_batch_and_with_every_seed():
         assert len(rows) == 40
     different = {tuple(rows) for rows in [*rows_of_large, *rows_of_other_seed]}
     assert len(different) == 8
+
+
+def test_loader_draws_the_points_of_every_batch_from_a_stream_of_its_own():
+    """The published draw: of random numbers in (0, 1), those of the smallest ones, in order."""
+    points = torch.rand(6, 60, 3)
+    sizes = torch.tensor([60, 40, 55, 45, 50, 42])
+    clouds = Clouds(points, torch.zeros(6, dtype=torch.long), sizes=sizes)
+
+    batches = list(CloudLoader(clouds, 2, shuffle=True, seed=5))
+
+    for number, batch in enumerate(batches):
+        drawn = torch.rand(2, 60, generator=generator(14, 5, 0, number))
+        fewest = int(sizes[batch.rows].min())
+        for row, numbers, cloud in zip(batch.rows, drawn, batch.points, strict=True):
+            of_cloud = numbers[: sizes[row]]
+            kept = of_cloud.argsort()[:fewest].sort().values
+            assert torch.equal(cloud, points[row][kept])
+    assert len(batches) == 3
 
 
 RUN = [

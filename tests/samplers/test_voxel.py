@@ -110,3 +110,18 @@ def test_voxel_fills_up_coincident_points():
     assert torch.equal(sampled[:3], places)  # in order of decreasing population
     assert torch.equal(sampled.unique(dim=0), places.unique(dim=0))
     assert len(output.indices.unique()) == 7
+
+
+def test_voxel_fills_up_with_the_same_coordinates_in_any_order_of_the_input():
+    """Which place is filled up by a copy is a tie, that the seeded order of coordinates breaks."""
+    places = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    points = places.repeat_interleave(torch.tensor([5, 4, 3, 2]), 0)
+
+    fills = []
+    for seed in range(6):
+        order = torch.randperm(14, generator=torch.Generator().manual_seed(seed))
+        (sampled,) = VoxelSampler(6)(points[order][None]).points
+        assert torch.equal(sampled[:4], places)
+        fills.append(sampled[4:].tolist())
+
+    assert fills == fills[:1] * 6

@@ -15,9 +15,17 @@ INFO = 1
 HIERARCHY = 1000
 """Numbers of COPC's records."""
 
+ENTRY = struct.Struct("<4iQ2i")
+"""Level, x, y and z of a cell; place, size and number of its points, -1 for a page of entries."""
+
 
 def write_copc(
-    path: Path, points: NDArray[np.float64], spacing: float, depth: int = 3, each: int = 300
+    path: Path,
+    points: NDArray[np.float64],
+    spacing: float,
+    depth: int = 3,
+    each: int = 300,
+    in_pages: bool = False,
 ) -> None:
     """Write points ``(n, 3)`` with their rows as ``intensity`` modulo 65,536.
 
@@ -27,6 +35,7 @@ def write_copc(
         spacing: of the root's points; it is halved at each level.
         depth: deepest level, which takes all points that are left.
         each: points of every other cell.
+        in_pages: whether the cells of each octant, but for the root, are in a page of their own.
     """
     low = points.min(0)
     high = points.max(0)
@@ -61,12 +70,31 @@ def write_copc(
         write_header(0, 0)
         cells = _write_cells(stream, laz, record, points, centre - half, 2 * half, depth, each)
         end = stream.seek(0, 2)
-        page = b""
-        for cell in cells:
-            page += struct.pack("<4iQ2i", *cell)
-        head = struct.pack("<H16sHQ32s", 0, b"copc", HIERARCHY, len(page), b"")
-        stream.write(head + page)
-        write_header(end + 60, len(page))
+        pages = [cells]
+        if in_pages:
+            pages = _pages_of_octants(cells, end + 60)
+        hierarchy = b"".join(ENTRY.pack(*cell) for page in pages for cell in page)
+        head = struct.pack("<H16sHQ32s", 0, b"copc", HIERARCHY, len(hierarchy), b"")
+        stream.write(head + hierarchy)
+        write_header(end + 60, ENTRY.size * len(pages[0]))
+
+
+def _pages_of_octants(cells, start):
+    """Return the entries of the first page, and of one page for each octant behind it."""
+    root, *others = cells
+    octants: dict[tuple[int, int, int], list[tuple[int, ...]]] = {}
+    for cell in others:
+        level, x, y, z, *_ = cell
+        shift = level - 1
+        octant = (x >> shift, y >> shift, z >> shift)
+        octants.setdefault(octant, []).append(cell)
+    first_page = [root]
+    start += ENTRY.size * (1 + len(octants))
+    for octant, page in octants.items():
+        size = ENTRY.size * len(page)
+        first_page.append((1, *octant, start, size, -1))
+        start += size
+    return [first_page, *octants.values()]
 
 
 def _write_cells(stream, laz, record, points, corner, side, depth, each):

@@ -37,6 +37,31 @@ def test_stratify_min_keeps_rare_points():
     assert kept_classes(rows) == {-1: 3, 3: 12, 7: 5}
 
 
+@pytest.mark.parametrize(
+    ("sizes", "m", "least", "kept"),
+    [
+        # Shares of 2.5 each: the lower class has the odd point.
+        ([100, 100], 5, None, {0: 3, 1: 2}),
+        # Shares of 1.75, 1.75, 0.5: the largest remainders have the two points left.
+        ([70, 70, 20], 4, None, {0: 2, 1: 2}),
+        # Beside the two rare classes, 12 points: four each, and 2.86 and 1.14 of the others.
+        ([100, 60, 4, 4], 20, 4, {0: 7, 1: 5, 2: 4, 3: 4}),
+        # One each, and of the other six 3.43, 1.71 and 0.85.
+        ([50, 30, 20, 1], 10, 1, {0: 4, 1: 3, 2: 2, 3: 1}),
+        # As many as the classes have.
+        ([5, 3, 1], 9, 2, {0: 5, 1: 3, 2: 1}),
+    ],
+)
+def test_stratify_shares_points_by_the_largest_remainder(sizes, m, least, kept):
+    numbers = torch.tensor(sizes)
+    classes = torch.arange(len(sizes)).repeat_interleave(numbers)
+    cloud = torch.rand(sum(sizes), 3, generator=torch.Generator().manual_seed(1))
+
+    _, rows = downsample(cloud, m, "random", stratify=classes, stratify_min=least)
+
+    assert kept_classes(rows, classes) == kept
+
+
 @pytest.mark.parametrize("least", [np.int64(5), torch.tensor(5)])
 def test_stratify_min_takes_whole_numbers_of_numpy_and_torch(least):
     _, rows = downsample(CLOUD, 20, stratify=CLASSES, stratify_min=least)

@@ -99,3 +99,58 @@ def test_classes_of_npz_decide_the_version_of_las(largest, version, tmp_path):
     assert str(las.header.version) == version
     assert list(las.classification) == [1, 2, largest]
     assert not list(las.point_format.extra_dimension_names)
+
+
+def test_npz_points_are_those_of_the_first_known_name(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez(path, pos=np.ones((3, 3)), points=np.eye(3), xyz=np.zeros((3, 3)))
+
+    table = contents(path)
+
+    assert table.points.tolist() == np.eye(3).tolist()
+    assert list(table.columns) == ["pos_0", "pos_1", "pos_2", "xyz_0", "xyz_1", "xyz_2"]
+
+
+def test_npz_arrays_keep_their_shapes_and_come_in_native_order(tmp_path):
+    source = tmp_path / "a.npz"
+    out = tmp_path / "b.npz"
+    one_wide = np.arange(3.0).reshape(3, 1)
+    swapped = np.array([1, 2, 300], ">u2")
+    np.savez(source, points=np.eye(3), score=one_wide, stamp=swapped)
+
+    table = contents(source)
+    write_table(out, table)
+
+    assert table.columns["score"].tolist() == [0, 1, 2]
+    assert table.columns["stamp"].dtype.isnative
+    again = np.load(out)
+    assert again["score"].tolist() == one_wide.tolist()
+    assert again["stamp"].tolist() == [1, 2, 300]
+
+
+def test_npz_array_of_which_a_column_changed_its_type_is_written_by_columns(tmp_path):
+    source = tmp_path / "a.npz"
+    out = tmp_path / "b.npz"
+    rgb = np.arange(9, dtype=np.uint8).reshape(3, 3)
+    np.savez(source, points=np.eye(3), rgb=rgb)
+    fractions = np.array([0.5, 1.5, 2.5])
+
+    write_table(out, contents(source).with_columns({"rgb_1": fractions}))
+
+    again = np.load(out)
+    assert set(again) == {"points", "rgb_0", "rgb_1", "rgb_2"}
+    assert again["rgb_0"].dtype == np.uint8
+    assert again["rgb_1"].tolist() == [0.5, 1.5, 2.5]
+
+
+def test_npy_fields_in_another_byte_order_come_in_native_order(tmp_path):
+    path = tmp_path / "a.npy"
+    fields = [("x", ">f8"), ("y", ">f8"), ("z", ">f8"), ("label", ">i4")]
+    rows = np.array([(1.5, 2.5, 3.5, 70_000)], fields)
+    np.save(path, rows)
+
+    table = contents(path)
+
+    assert table.points.tolist() == [[1.5, 2.5, 3.5]]
+    assert table.columns["label"].tolist() == [70_000]
+    assert table.columns["label"].dtype.isnative

@@ -6,6 +6,7 @@ import pytest
 from mops_lightning.data.formats.area import Area
 from mops_lightning.data.formats.registry import open_cloud_file, read, write
 from mops_lightning.data.formats.table import Table
+from mops_lightning.errors import UserError
 from tests.support.copc import write_copc
 
 GRID = np.indices((5, 5, 5), np.float64).reshape(3, 125).T
@@ -37,6 +38,43 @@ def test_bounds_without_z_keep_points_below_zero(tmp_path):
     inside = read(path, 1, 0, area)
 
     assert inside.points[:, 2].tolist() == [-7.0, 7.0]
+
+
+def test_bounds_of_a_bin_file_hold_for_its_named_columns(tmp_path):
+    path = tmp_path / "a.bin"
+    rows = np.array([[0, 1, 2, 3], [0, 5, 6, 7]], "<f4")
+    rows.tofile(path)
+    columns = ("time", "x", "y", "z")
+
+    inside = read(path, 1, 0, Area.parse("0,0,3,3", None, None), columns)
+
+    assert inside.points.tolist() == [[1, 2, 3]]
+
+
+def test_bounds_of_a_mesh_hold_for_its_vertices(tmp_path):
+    path = tmp_path / "a.off"
+    path.write_text("OFF\n3 1 0\n0 0 0\n9 0 0\n0 9 0\n3 0 1 2\n")
+    area = Area.parse("-1,-1,1,9", None, None)
+
+    inside = read(path, 50, 0, area, vertices=True)
+
+    assert inside.points.tolist() == [[0, 0, 0], [0, 9, 0]]
+
+
+@pytest.mark.parametrize(("level", "resolution"), [(1, None), (None, 0.5)])
+def test_bounds_with_a_level_or_a_resolution_need_a_file_with_levels(level, resolution, tmp_path):
+    path = tmp_path / "a.ply"
+    write(path, Table(GRID))
+    area = Area.parse("0,0,2,2", level, resolution)
+
+    with pytest.raises(UserError, match="--level and --resolution need a COPC file"):
+        read(path, 1, 0, area)
+
+
+@pytest.mark.parametrize("bounds", ["0,0,0,2", "2,0,0,2", "0,0,5,1,1,5", "0,0,2", "a,0,2,2"])
+def test_bounds_whose_min_is_not_below_the_max_are_refused(bounds):
+    with pytest.raises(UserError, match="every min below its max"):
+        Area.parse(bounds, None, None)
 
 
 def rows_between(low, high):

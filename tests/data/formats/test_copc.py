@@ -114,6 +114,23 @@ def test_levels_are_even_samples(small_cells, tmp_path):
         assert len(points) <= 1.4 * side**2
 
 
+def test_root_keeps_the_points_nearest_to_the_centres_of_its_cubes(small_cells, tmp_path):
+    """Eight cubes along each side; four points of a level plane are in each."""
+    out = tmp_path / "out.copc.laz"
+    corners = np.indices((8, 8)).reshape(2, 64).T
+    in_cube = [(0.5, 0.5), (0.05, 0.05), (0.9, 0.9), (0.1, 0.8)]
+    of_cubes = [corners + place for place in in_cube]
+    ends = np.array([[0.0, 0.0], [8.0, 8.0]])
+    plane = np.concatenate([*of_cubes, ends])
+    heights = np.zeros(len(plane))
+
+    write(out, Table(np.column_stack([plane, heights])))
+
+    root = read(out, 1, 0, Area(level=0)).points
+    places = root[:, :2].round(6).tolist()
+    assert sorted(places) == (corners + 0.5).tolist()
+
+
 @pytest.mark.parametrize(
     ("share_of_side", "level"),
     [

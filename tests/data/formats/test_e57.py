@@ -62,6 +62,57 @@ def test_read_e57_joins_scans_at_their_poses(tmp_path):
     assert_array_equal(columns["intensity"][30:], second["intensity"])
 
 
+def test_cartesian_of_ranges_azimuths_and_elevations():
+    eighth = np.pi / 4
+    seen = np.array(
+        [
+            [2, 0, 0],
+            [2, 2 * eighth, 0],
+            [2, eighth, eighth],
+            [2, 0, -2 * eighth],
+        ]
+    )
+
+    points = e57._cartesian(seen)
+
+    expected = [[2, 0, 0], [0, 2, 0], [1, 1, np.sqrt(2)], [0, 0, -2]]
+    assert_allclose(points, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "numbers", "kind"),
+    [
+        ("red", [0, 255], np.uint8),
+        ("row", [0, 256], np.uint16),
+        ("row", [-1, 70_000], np.int32),
+        ("row", [0, 2**40], np.float64),
+        ("intensity", [0.5, np.nan], np.float32),
+        ("time", [0.5, 0.1], np.float64),
+    ],
+)
+def test_numbers_of_scans_get_the_smallest_type_that_holds_them(name, numbers, kind):
+    values = np.array(numbers, np.float64)
+
+    column = e57._narrow(name, values)
+
+    assert column.dtype == kind
+    assert_array_equal(column, values)
+
+
+def test_read_e57_names_what_one_of_its_scans_lacks(tmp_path):
+    path = tmp_path / "a.e57"
+    without_intensity = scan(2)
+    del without_intensity["intensity"]
+    with pye57.E57(str(path), mode="w") as file:
+        file.write_scan_raw(scan(1))
+        file.write_scan_raw(without_intensity)
+
+    table = contents(path)
+
+    assert sorted(table.columns) == ["blue", "green", "red", "scan"]
+    assert table.form.left_out == ("intensity",)
+
+
 def test_downsample_e57_leaves_invalid_points_out(tmp_path):
     path = tmp_path / "a.e57"
     invalid = np.zeros(30, np.int8)

@@ -105,6 +105,25 @@ def test_bin_says_how_many_numbers_change_and_what_has_no_room(tmp_path, capsys)
 
 
 @pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("# x y z\n1 2 3\n4 5 6\n", "# x y z label\n1 2 3 7\n4 5 6 8\n"),
+        ("z,x,y\n3,1,2\n6,4,5\n", "z,x,y,label\n3,1,2,7\n6,4,5,8\n"),
+        ("1 2 3\n4 5 6\n", "# x y z label\n1 2 3 7\n4 5 6 8\n"),
+    ],
+)
+def test_text_with_a_new_column_has_it_last_in_rows_and_header(text, expected, tmp_path):
+    source = tmp_path / "in.txt"
+    out = tmp_path / "out.txt"
+    source.write_text(text)
+    table = contents(source)
+
+    write(out, table.with_columns({"label": np.array([7, 8])}))
+
+    assert out.read_text() == expected
+
+
+@pytest.mark.parametrize(
     "text",
     [
         '"X","Y","Z","class","stamp"\n0.1,2.5,1e-07,3,1764290000123456789\n1,2.25,3.7,4,1\n',

@@ -17,8 +17,11 @@ from mops_lightning.errors import UserError
 from tests.support.clouds import uniform_points
 from tests.support.las import full_cloud, header_fields
 
-MINOR, BOUNDS, WAVEFORMS = 25, 179, 227
+ENCODING, MINOR, BOUNDS, WAVEFORMS = 6, 25, 179, 227
 """Places in the header."""
+
+WAVEFORMS_INSIDE = 2
+"""Bit of the encoding."""
 
 
 def patched(path, kind, place, *values):
@@ -112,6 +115,7 @@ def test_waveforms_inside_of_the_file_are_refused_unless_left_out(tmp_path):
     cloud = full_cloud(4)
     cloud.write(path)
     patched(path, "<Q", WAVEFORMS, path.stat().st_size)
+    patched(path, "<H", ENCODING, WAVEFORMS_INSIDE)
     table = read(path, 1, 0)
 
     with pytest.raises(UserError, match="would lose the waveforms, which are inside of IN"):
@@ -121,6 +125,7 @@ def test_waveforms_inside_of_the_file_are_refused_unless_left_out(tmp_path):
     again = laspy.read(out)
     assert_array_equal(again.xyz, cloud.xyz)
     assert not again.header.start_of_waveform_data_packet_record
+    assert not again.header.global_encoding.waveform_data_packets_internal
 
 
 def bytes_by_point(cloud):
@@ -225,6 +230,7 @@ def test_columns_of_other_formats_become_dimensions(tmp_path):
     for name, column in zip(names, columns.values(), strict=True):
         assert_array_equal(again[name], column)
     assert set(np.asarray(again.return_number)) == {1}
+    assert str(again.header.version) == "1.2"
 
 
 NO_DATA, SMALLEST, LARGEST = 1, 2, 4
@@ -273,7 +279,7 @@ def test_ranges_of_extra_dimensions_are_those_of_the_points_that_are_kept(name, 
     cloud[height][50] = np.nan
     cloud.write(path)
     with_range(path, "Amplitude", "<Q", EACH, (50,), (0,), (299,))
-    with_range(path, "Colors", "<3Q", limits, (0, 0, 0), (0, 0, 0), (255, 255, 255))
+    with_range(path, "Colors", "<3Q", EACH, (150, 178, 0), (0, 0, 0), (255, 255, 255))
     with_range(path, height, "<d", limits, (0,), (-10,), (289,))
     with_range(path, "long steps", "<q", 0, (0,), (7,), (8,))
     table = read(path, 1, 0)
@@ -285,9 +291,9 @@ def test_ranges_of_extra_dimensions_are_those_of_the_points_that_are_kept(name, 
     assert smallest == (51,)
     assert largest == (59,)
     no_data, smallest, largest = range_of(out, "Colors", "<3Q")
-    assert no_data == (0, 0, 0)
-    assert smallest == (150, 151, 152)
-    assert largest == (177, 178, 179)
+    assert no_data == (150, 178, 0)
+    assert smallest == (153, 151, 152)
+    assert largest == (177, 175, 179)
     no_data, smallest, largest = range_of(out, height, "<d")
     assert no_data == (0,)
     assert smallest == (41,)

@@ -133,6 +133,22 @@ def test_strings_of_an_npz_file_are_left_out(tmp_path):
     assert not contents(path).columns
 
 
+def test_first_of_two_columns_that_differ_in_capitals_alone_is_the_coordinate(tmp_path):
+    source = tmp_path / "a.npy"
+    out = tmp_path / "b.ply"
+    fields = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("X", "f4")]
+    np.save(source, np.array([(1, 2, 3, 9), (4, 5, 6, 8)], fields))
+
+    table = contents(source)
+    write_table(out, table)
+
+    assert table.points.tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert table.columns["X"].tolist() == [9, 8]
+    again = contents(out)
+    assert again.points.tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert again.columns["X_"].tolist() == [9, 8]
+
+
 WITH_LIST = """\
 ply
 format binary_little_endian 1.0

@@ -6,6 +6,7 @@ from numpy.testing import assert_array_equal
 
 from mops_lightning.data.formats.bin_columns import parse_columns
 from mops_lightning.data.formats.registry import open_cloud_file, read, write
+from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import UserError
 from tests.support.cloud_files import contents
 
@@ -159,6 +160,36 @@ def test_read_label_file_gives_class_and_instance(scans, labels, tmp_path):
     assert whole["label"].tolist() == list(range(40))
     assert whole["instance"].tolist() == list(range(7, 47))
     assert part["label"].tolist() == list(range(10, 20))
+
+
+def test_write_bin_keeps_the_columns_of_a_scan_with_labels(sweep, tmp_path):
+    source = tmp_path / "a.bin"
+    copy = tmp_path / "b.bin"
+    sweep.tofile(source)
+    np.ones(400, "<u4").tofile(tmp_path / "a.label")
+
+    write(copy, read(source, 9, 0, columns=NUSCENES))
+
+    assert_array_equal(rows_of_bin(copy), sweep)
+
+
+def test_read_bin_of_nuscenes_is_known_by_its_name_in_capitals(sweep, tmp_path):
+    path = tmp_path / "A.PCD.BIN"
+    sweep.tofile(path)
+
+    table = contents(path)
+
+    assert_array_equal(table.columns["ring"], sweep[:, 4])
+
+
+def test_write_bin_of_points_that_float32_moves_by_a_millionth_is_refused(tmp_path):
+    """Float32 has steps of 1/128 m at 100 km, which is a millionth of 8 km."""
+    near = np.array([[100_000.003, 0, 0], [109_000.0, 0, 0]])
+    far = np.array([[100_000.003, 0, 0], [101_000.0, 0, 0]])
+
+    write(tmp_path / "near.bin", Table(near))
+    with pytest.raises(UserError, match=r"far from the origin, by up to 0\.003"):
+        write(tmp_path / "far.bin", Table(far))
 
 
 def test_read_label_file_of_another_scan_is_refused(tmp_path):
