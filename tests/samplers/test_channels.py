@@ -116,6 +116,8 @@ def test_learned_sampler_returns_channels_with_normals_of_length_one(name, train
     assert_close(lengths, torch.ones(B, M))
     if output.soft_projected is not None:
         assert output.soft_projected.shape == (B, M, 7)
+        lengths_of_projected = output.soft_projected[..., 4:].norm(dim=2)
+        assert_close(lengths_of_projected, torch.ones(B, M))
 
 
 @pytest.mark.parametrize("name", LEARNED)

@@ -184,6 +184,17 @@ def test_poisson_by_weight_keeps_heavy_points(rand):
     assert (weight_of_kept.mean(1) > 1.2 * weight.mean(1)).all()
 
 
+def test_poisson_by_weight_does_not_depend_on_the_weights_of_other_clouds(rand):
+    points = rand(2, 100, 3)
+    weight = rand(2, 100).double() + 0.01
+    weight[1] *= 1e-20
+
+    first_row, _ = eliminate(points, 40, weight)
+
+    (alone,) = eliminate(points[:1], 40, weight[:1])
+    assert torch.equal(first_row, alone)
+
+
 @pytest.mark.parametrize("m", [2, 5, 12])
 def test_spacing_bound_is_upper_bound(m, rng, randn):
     points = randn(20, 30, 3, dtype=torch.float64)

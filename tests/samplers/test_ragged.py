@@ -251,6 +251,27 @@ def test_weights_of_single_batched_and_ragged_clouds_agree(sampler, net, rand):
         assert len(rows_alone.unique()) == 8
 
 
+@pytest.mark.parametrize("weight", [None, "curvature", "numbers"])
+def test_clouds_of_sizes_in_turn_are_sampled_by_their_own_weights(weight, rand):
+    sizes = [30, 8, 40, 30, 8, 40]  # 8 points are as many as are kept
+    clouds = [rand(size, 3) for size in sizes]
+    given: list[Any] = [weight] * len(sizes)
+    joined: Any = weight
+    if weight == "numbers":
+        given = [rand(size) for size in sizes]
+        joined = torch.cat(given)
+    batch = torch.arange(6).repeat_interleave(torch.tensor(sizes))
+    sampler = FPSSampler(8)
+
+    chosen, _ = sampler.downsample(torch.cat(clouds), batch=batch, weight=joined)
+
+    expected = []
+    for cloud, weight_of_cloud in zip(clouds, given, strict=True):
+        points, _ = sampler.downsample(cloud, weight=weight_of_cloud)
+        expected.append(points)
+    assert torch.equal(chosen, torch.cat(expected))
+
+
 def test_weights_by_curvature_are_those_of_each_cloud(rand):
     points = rand(90, 3)
     weight = curvature(points.numpy())
@@ -298,7 +319,8 @@ def test_weights_for_other_methods_and_samplers_in_training_mode_are_rejected(ne
 
     with pytest.raises(UserError, match="VoxelSampler takes no weights"):
         VoxelSampler(8).downsample(points, weight=weight)
-    with pytest.raises(UserError, match="generated readout takes no weights"):
-        net.downsample(points, readout="generated", weight=weight)
+    for readout in ("generated", "matched"):
+        with pytest.raises(UserError, match=f"{readout} readout takes no weights"):
+            net.downsample(points, readout=readout, weight=weight)
     with pytest.raises(UserError, match=r"call eval\(\)"):
         SNet(8).downsample(points)

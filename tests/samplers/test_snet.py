@@ -18,13 +18,13 @@ FOR_RECONSTRUCTION: dict[str, Any] = {
 
 
 @pytest.mark.parametrize(
-    ("settings", "channels", "norms"),
+    ("settings", "channels", "norms", "biases"),
     [
-        ({}, [3, 64, 64, 64, 128, 128, 256, 256, 256, 96], 9),
-        (FOR_RECONSTRUCTION, [3, 64, 128, 128, 256, 128, 256, 256, 96], 5),
+        ({}, [3, 64, 64, 64, 128, 128, 256, 256, 256, 96], 9, 0),
+        (FOR_RECONSTRUCTION, [3, 64, 128, 128, 256, 128, 256, 256, 96], 5, 3),
     ],
 )
-def test_snet_has_published_layers(settings, channels, norms):
+def test_snet_has_published_layers(settings, channels, norms, biases):
     net = SNet(32, **settings)
 
     sizes = []
@@ -32,6 +32,8 @@ def test_snet_has_published_layers(settings, channels, norms):
         sizes.append((layer.in_features, layer.out_features))
     assert sizes == list(pairwise(channels))
     assert len(modules_of(net, nn.BatchNorm1d)) == norms
+    with_bias = [layer for layer in modules_of(net, nn.Linear) if layer.bias is not None]
+    assert len(with_bias) == biases  # where there is no BatchNorm
 
 
 def modules_of(net, kind):
