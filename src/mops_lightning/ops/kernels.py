@@ -96,8 +96,8 @@ def build_tree(planes, channels, leaf):
     child = np.empty(size, np.uint8)
     counts = np.empty(FANOUT, np.int64)
     places = np.empty(size, np.uint32)
-    moved_rows = np.empty(size, np.uint32)
     moved = np.empty(size, planes.dtype)
+    moved_rows = moved.view(np.uint32)  # coordinates and rows are moved one after the other
     nodes[0] = 0
     nodes[1] = size
     node = 0
