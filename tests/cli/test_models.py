@@ -130,3 +130,27 @@ def test_models_arguments_of_other_uses_are_refused(arguments, words):
     status, out, err = captured(main, arguments, COMMAND)
     assert (status, out) == (2, "")
     assert words in err
+
+
+def test_models_add_names_the_task_net_and_replaces_a_model_on_request(tmp_path):
+    write_run(tmp_path / "run")
+    arguments = ["add", tmp_path / "run", "fmops.mine", "--folder", tmp_path]
+    done(main, arguments, COMMAND)
+
+    task_net = ["--task-net", "pointnet.modelnet40", "--overwrite"]
+    out = done(main, [*arguments, *task_net], COMMAND)
+
+    files = model_file.read_card(tmp_path / "fmops.mine.safetensors")["record"]["files"]
+    assert files["task_weights"].startswith("pointnet.modelnet40@sha256:")
+    assert "also needs weights=FILE" not in out
+
+
+def test_models_says_that_the_code_of_a_run_was_changed(tmp_path):
+    git = {"commit": "0123abc", "dirty": True}
+    write_run(tmp_path / "run", git=git)
+    done(main, ["add", tmp_path / "run", "fmops.mine", "--folder", tmp_path], COMMAND)
+
+    card = done(main, [tmp_path / "fmops.mine.safetensors"], COMMAND)
+
+    shown = dict(line.split(maxsplit=1) for line in card.splitlines())
+    assert shown["commit"] == "0123abc (changed)"

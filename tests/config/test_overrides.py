@@ -47,7 +47,7 @@ def test_own_class_chooses_the_group_of_own_and_takes_any_setting():
 
 def test_home_folder_is_known_by_its_tilde(monkeypatch):
     monkeypatch.setenv("HOME", "/home/me")
-    for key in overrides.FOLDERS:
+    for key in ("out", "hydra.run.dir", "hydra.sweep.dir"):
         assert overrides.with_home(f"{key}=~/a=b") == f"{key}='/home/me/a=b'"
         with pytest.raises(UserError, match=f"^{key}=~nosuchuser: no user has this name"):
             overrides.with_home(f"{key}=~nosuchuser")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from mops_lightning import downsample
+from mops_lightning import FPSSampler, downsample
 from mops_lightning.errors import UserError
 from mops_lightning.ops.points import UnitSphere
 from mops_lightning.ops.spacing import keep_spaced
@@ -298,3 +298,78 @@ def test_points_that_are_not_finite_are_refused():
 
     with pytest.raises(UserError, match="points must be finite"):
         downsample(points, spacing=1.0)
+
+
+def test_voxel_rows_are_ascending():
+    _, rows = downsample(CLOUD, voxel=2.0)
+    _, weighted = downsample(CLOUD, voxel=2.0, weight=torch.ones(200))
+
+    assert rows.tolist() == sorted(rows.tolist())
+    assert weighted.tolist() == rows.tolist()
+
+
+def test_voxel_means_have_the_type_of_the_points():
+    single, _ = downsample(CLOUD, voxel=2.0, readout="generated")
+    whole, _ = downsample(torch.arange(12).view(4, 3), voxel=6.0, readout="generated")
+
+    assert single.dtype == torch.float32
+    assert whole.dtype == torch.float64
+    expected = [[1.5, 2.5, 3.5], [7.5, 8.5, 9.5]]
+    np.testing.assert_allclose(whole, expected, atol=1e-9)
+
+
+def test_curvature_as_weight_is_that_of_the_coordinates():
+    coordinates = CLOUD.numpy()
+    points = np.column_stack([coordinates, np.arange(200.0) ** 2])
+
+    _, rows = downsample(points, spacing=1.5, weight="curvature")
+
+    _, expected = downsample(coordinates, spacing=1.5, weight="curvature")
+    assert rows.tolist() == expected.tolist()
+
+
+def test_weights_of_a_flat_batch_belong_to_its_points():
+    weight = torch.ones(200)
+    weight[[7, 130]] = 5.0
+    weight[:5] = 0.0
+    batch = torch.tensor([0] * 50 + [1] * 150)
+
+    _, rows = downsample(CLOUD, spacing=2.0, batch=batch, weight=weight)
+
+    _, of_first = downsample(CLOUD[:50], spacing=2.0, weight=weight[:50])
+    _, of_second = downsample(CLOUD[50:], spacing=2.0, weight=weight[50:])
+    assert rows.tolist() == [*of_first.tolist(), *(of_second + 50).tolist()]
+    assert {7, 130} <= set(rows.tolist())
+
+
+def test_space_starts_where_it_is_told_or_by_the_seed():
+    space = (1, 1, 0)
+
+    _, from_row = downsample(CLOUD, 5, start=42, space=space)
+    _, first = downsample(CLOUD, 5, seed=0, space=space)
+    _, second = downsample(CLOUD, 5, seed=3, space=space)
+    _, default = downsample(CLOUD, 5, space=space)
+
+    assert from_row[0] == 42
+    assert first.tolist() != second.tolist()
+    assert default.tolist() == first.tolist()
+
+
+def test_space_with_weights_leaves_zeros_out():
+    weight = torch.ones(200)
+    weight[:150] = 0.0
+
+    _, rows = downsample(CLOUD, 10, space=(1, 1, 0), weight=weight)
+
+    _, expected = downsample(CLOUD[150:], 10, space=(1, 1, 0))
+    assert rows.tolist() == (expected + 150).tolist()
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_farthest_points_start_by_the_seed_of_the_sampler(seed):
+    _, rows = downsample(CLOUD, 6, seed=seed)
+    _, of_array = downsample(CLOUD.numpy(), 6, seed=seed)
+
+    _, expected = FPSSampler(6, seed=seed).downsample(CLOUD)
+    assert rows.tolist() == expected.tolist()
+    assert of_array.tolist() == expected.tolist()

@@ -4,9 +4,12 @@ import pytest
 import torch
 from torch import nn
 
+from mops_lightning.data.clouds import CloudDataset, Clouds
 from mops_lightning.errors import UserError
 from mops_lightning.nets.pointnet import PointNetVanilla
+from mops_lightning.tasks.classification import Classification
 from mops_lightning.zoo import weights
+from mops_lightning.zoo.outputs import check_names
 from tests.support.models import rewrite
 
 
@@ -122,3 +125,33 @@ def test_read_not_finite_is_refused(saved, value):
     weights.save(path, net, {}, {})
     with pytest.raises(weights.Damaged, match=r"head\.0\.weight is not finite"):
         weights.load_into(PointNetVanilla(4), path)
+
+
+def test_names_of_classes_keep_the_order_of_the_outputs(tmp_path):
+    path = tmp_path / weights.FILE
+    weights.save(path, PointNetVanilla(3), {}, {}, ("vase", "bowl", "cup"))
+
+    assert weights.read(path)["classes"] == ["vase", "bowl", "cup"]
+
+
+@pytest.mark.parametrize("names", [("b", "a"), ("a", "b", "c"), ("a", "d")])
+def test_net_of_other_classes_or_of_another_order_is_refused(names):
+    clouds = Clouds(torch.rand(2, 8, 3), torch.tensor([0, 1]))
+    dataset = CloudDataset(("a", "b"), clouds, clouds, "")
+    task = Classification(PointNetVanilla(2), 2)
+
+    check_names(["a", "b"], task, dataset, "net")
+    with pytest.raises(UserError, match="classes, which are not the 2 classes of the data"):
+        check_names(list(names), task, dataset, "net")
+
+
+def test_joint_run_gives_its_task_net_and_another_run_what_it_trained(tmp_path):
+    joint = tmp_path / "joint"
+    alone = tmp_path / "alone"
+    for folder in (joint, alone):
+        folder.mkdir()
+        (folder / weights.FILE).touch()
+    (joint / "task_weights.safetensors").touch()
+
+    assert weights.of_task_net(joint) == joint / "task_weights.safetensors"
+    assert weights.of_task_net(alone) == alone / weights.FILE

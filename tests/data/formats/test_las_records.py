@@ -23,7 +23,7 @@ ROW = np.arange(20)
 
 
 def write_with_extra(path, *kinds):
-    """Write 20 points with extra dimensions, all of which hold the row."""
+    """Write 20 points with extra dimensions of the row, and arrays of the row plus 100."""
     header = laspy.LasHeader(point_format=1, version="1.2")
     for name, kind in kinds:
         header.add_extra_dim(laspy.ExtraBytesParams(name, kind))
@@ -34,7 +34,7 @@ def write_with_extra(path, *kinds):
     for name, kind in kinds:
         values = ROW
         if kind[0].isdigit():
-            values = np.repeat(ROW[:, None], int(kind[0]), axis=1)
+            values = np.repeat(ROW[:, None] + 100, int(kind[0]), axis=1)
         cloud[name] = values
     cloud.write(path)
 
@@ -111,10 +111,10 @@ def test_entries_of_undocumented_bytes_stand_before_others(name, tmp_path):
     write(out, table.take(ROW[5:9]))
 
     assert table.columns["label"].tolist() == ROW.tolist()
-    assert table.columns["padding_2"].tolist() == ROW.tolist()
+    assert table.columns["padding_2"].tolist() == [row + 100 for row in range(20)]
     again = read(out, 1, 0).columns
     assert again["label"].tolist() == [5, 6, 7, 8]
-    assert again["padding_0"].tolist() == [5, 6, 7, 8]
+    assert again["padding_0"].tolist() == [105, 106, 107, 108]
     label = entry_named(out, "label")
     assert struct.unpack_from("<Q", label, SMALLEST) == (5,)
     assert struct.unpack_from("<Q", label, LARGEST) == (8,)

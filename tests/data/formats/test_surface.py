@@ -212,3 +212,92 @@ def test_colours_that_a_part_of_a_scene_lacks_are_named(tmp_path):
     table = contents(path)
 
     assert table.form.left_out == ("red", "green", "blue", "alpha")
+
+
+def test_colours_of_faces_reach_the_points_on_them(tmp_path):
+    path = tmp_path / "a.ply"
+    more = "property uchar red\nproperty uchar green\nproperty uchar blue\n"
+    axes = "property float x\nproperty float y\nproperty float z\n"
+    path.write_text(
+        f"ply\nformat ascii 1.0\nelement vertex 4\n{axes}element face 2\n"
+        f"property list uchar int vertex_indices\n{more}end_header\n"
+        "0 0 0\n1 0 0\n1 1 0\n0 1 0\n3 0 1 2 9 0 7\n3 0 2 3 200 0 7\n"
+    )
+
+    table = read(path, 200, 0)
+
+    x, y, _ = table.points.T
+    assert_array_equal(table.columns["red"][x > y], 9)
+    assert_array_equal(table.columns["red"][x < y], 200)
+    assert set(table.columns["blue"]) == {7}
+
+
+def test_normals_of_length_zero_stay_zero(tmp_path):
+    path = tmp_path / "a.ply"
+    axes = "property float x\nproperty float y\nproperty float z\n"
+    normals = "property float nx\nproperty float ny\nproperty float nz\n"
+    rows = "0 0 0 0 0 0\n1 0 0 0 0 0\n0 1 0 0 0 0\n3 0 1 2\n"
+    path.write_text(
+        f"ply\nformat ascii 1.0\nelement vertex 3\n{axes}{normals}element face 1\n"
+        f"property list uchar int vertex_indices\nend_header\n{rows}"
+    )
+
+    table = read(path, 20, 0)
+
+    assert_array_equal(normals_of(table), np.zeros((20, 3)))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "lost"),
+    [
+        (
+            "a.off",
+            "COFF\n3 1 0\n0 0 0 9 9 9 255\n1 0 0 9 9 9 255\n0 1 0 9 9 9 255\n3 0 1 2\n",
+            "colours",
+        ),
+        ("a.obj", "usemtl red\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "materials"),
+    ],
+)
+def test_colours_and_materials_that_are_not_read_are_named(name, content, lost, tmp_path):
+    path = tmp_path / name
+    path.write_text(content)
+
+    assert contents(path).form.left_out == (lost,)
+
+
+def test_interleaved_int8_positions_and_normals_of_glb(tmp_path):
+    """Positions stand for themselves, normals for shares of 127; -128 is -1, too."""
+    path = tmp_path / "a.glb"
+    rows = np.array(
+        [
+            [0, 0, 5, 0, 0, 0, 127, 0],
+            [100, 0, 5, 0, 0, 0, -127, 0],
+            [0, -100, 5, 0, -128, 0, 0, 0],
+        ],
+        "i1",
+    )
+    triangle = np.array([0, 1, 2, 0], "<u2")
+    buffer = rows.tobytes() + triangle.tobytes()
+    positions = {"bufferView": 0, "componentType": 5120, "count": 3, "type": "VEC3"}
+    normals = {**positions, "byteOffset": 4, "normalized": True}
+    indices = {"bufferView": 1, "componentType": 5123, "count": 3, "type": "SCALAR"}
+    attributes = {"POSITION": 0, "NORMAL": 1}
+    tree = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": 2}]}],
+        "accessors": [positions, normals, indices],
+        "bufferViews": [
+            {"buffer": 0, "byteLength": 24, "byteStride": 8},
+            {"buffer": 0, "byteOffset": 24, "byteLength": 6},
+        ],
+        "buffers": [{"byteLength": len(buffer)}],
+    }
+    path.write_bytes(packed_glb(tree, buffer))
+
+    table = read(path, 9, 0, vertices=True)
+
+    assert table.points.tolist() == [[0, 0, 5], [100, 0, 5], [0, -100, 5]]
+    assert normals_of(table).tolist() == [[0, 0, 1], [0, 0, -1], [-1, 0, 0]]
