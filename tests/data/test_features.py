@@ -313,10 +313,11 @@ def test_cloud_folder_scaled_as_other_statistics_keeps_the_values(folder):
 
     scaled = data.scaled_as(trained, "a net")
 
-    intensity = data.channels.restored(data.test.points[..., 3:].double())
-    expected = (intensity - 50) / 4
-    found = scaled.test.points[..., 3:]
-    assert_close(found, expected.float())
+    splits = ((data.train, scaled.train), (data.test, scaled.test))
+    for before, after in splits:
+        intensity = data.channels.restored(before.points[..., 3:].double())
+        expected = (intensity - 50) / 4
+        assert_close(after.points[..., 3:], expected.float())
     assert scaled.channels == trained
     assert data.scaled_as(data.channels, "a net") is data
 

@@ -97,6 +97,27 @@ def test_scans_of_classes_without_parts_have_one_part_for_the_shape():
     assert torch.equal(outliers, plain.train.parts == of_stools)
 
 
+@pytest.mark.parametrize(
+    ("name", "distances", "intensity", "counts"),
+    [
+        ("airplane", (0.4767, 0.0368, 0.4745), 0.3719, {"floor": 871, "clutter": 38}),
+        ("bottle", (0.4065, 0.1162, 0.4631), 0.4081, {"floor": 729, "clutter": 35}),
+        ("chair", (0.4061, 0.1367, 0.4704), 0.4668, {"floor": 739, "clutter": 62}),
+        ("lamp", (0.4565, 0.1108, 0.4224), 0.2946, {"floor": 778, "clutter": 63}),
+    ],
+)
+def test_scans_are_those_of_published_figures(name, distances, intensity, counts):
+    """Means over four scans of 256 points; a change needs a new version of the generator."""
+    scans = [scan(name, 256, 0.1, 0.01, number) for number in range(4)]
+
+    points = np.concatenate([found.points for found in scans])
+    parts = np.concatenate([found.parts for found in scans])
+    intensities = np.concatenate([found.intensities for found in scans])
+    assert np.abs(points).mean(0) == pytest.approx(distances, abs=1e-4)
+    assert intensities.mean() == pytest.approx(intensity, abs=1e-4)
+    assert {part: int((parts == part).sum()) for part in counts} == counts
+
+
 def test_scan_without_noise_has_its_points_on_surfaces():
     found = scan(outliers=0.0)
 
