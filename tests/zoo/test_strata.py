@@ -44,6 +44,8 @@ def test_stratify_min_keeps_rare_points():
         ([100, 100], 5, None, {0: 3, 1: 2}),
         # Shares of 1.75, 1.75, 0.5: the largest remainders have the two points left.
         ([70, 70, 20], 4, None, {0: 2, 1: 2}),
+        # Shares of 1.6, 1.6 and 0.8: rounded, they would be five points.
+        ([40, 40, 20], 4, None, {0: 2, 1: 1, 2: 1}),
         # Beside the two rare classes, 12 points: four each, and 2.86 and 1.14 of the others.
         ([100, 60, 4, 4], 20, 4, {0: 7, 1: 5, 2: 4, 3: 4}),
         # One each, and of the other six 3.43, 1.71 and 0.85.

@@ -255,6 +255,7 @@ def test_normals_of_length_zero_stay_zero(tmp_path):
             "COFF\n3 1 0\n0 0 0 9 9 9 255\n1 0 0 9 9 9 255\n0 1 0 9 9 9 255\n3 0 1 2\n",
             "colours",
         ),
+        ("a.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2 9 0 7\n# end\n", "colours"),
         ("a.obj", "usemtl red\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "materials"),
     ],
 )

@@ -221,9 +221,21 @@ def _left_out(data: bytes, kind: str) -> tuple[str, ...]:
         return ("materials",)
     if kind == ".glb" and b'"textures"' in data:
         return ("textures",)
-    if kind == ".off" and re.match(rb"\s*(#[^\n]*\s*)*COFF", data):
+    if kind == ".off" and (_has_coloured_vertices(data) or _has_coloured_faces(data)):
         return ("colours",)
     return ()
+
+
+def _has_coloured_vertices(data: bytes) -> bool:
+    """Return whether an OFF file says that its vertices have colours."""
+    return re.match(rb"\s*(#[^\n]*\s*)*COFF", data) is not None
+
+
+def _has_coloured_faces(data: bytes) -> bool:
+    """Return whether the last face of an OFF file has numbers behind its corners."""
+    without_comments = re.sub(rb"#[^\n]*", b"", data[-4096:])
+    words = without_comments.strip().rpartition(b"\n")[2].split()
+    return bool(words) and words[0].isdigit() and len(words) > 1 + int(words[0])
 
 
 def _announced_faces(data: bytes, kind: str) -> int:
