@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from mops_lightning.ops import normals as module
 from mops_lightning.ops.normals import estimate_normals, upward_normals
 
 
@@ -45,6 +46,16 @@ def test_normals_are_those_of_12_neighbours_by_default():
     normals = estimate_normals(surface)
 
     assert np.array_equal(normals, estimate_normals(surface, 12))
+
+
+def test_normals_of_a_cloud_in_parts_are_those_of_the_whole(monkeypatch):
+    surface = wavy_surface()
+    whole = estimate_normals(surface)
+    monkeypatch.setattr(module, "PART", 150)
+
+    in_parts = estimate_normals(surface)
+
+    assert np.array_equal(in_parts, whole)
 
 
 GROUND = np.stack(np.meshgrid(np.arange(6.0), np.arange(6.0)), 2).reshape(-1, 2)

@@ -67,6 +67,15 @@ def test_normalize_of_coincident_points_is_zero(number, randn):
     assert torch.isfinite(gradient).all()
 
 
+def test_unit_sphere_of_equal_points_has_radius_one():
+    points = np.full((5, 3), 7.0)
+
+    sphere = UnitSphere.around(points)
+
+    assert sphere.radius == 1.0
+    assert (sphere.normalise(points) == 0).all()
+
+
 @pytest.mark.parametrize("farthest", [0, 20_000, 39_999])
 def test_unit_sphere_of_a_large_cloud_reaches_its_farthest_point_wherever_it_is(farthest):
     points = np.random.default_rng(0).uniform(-1, 1, (40_000, 3))

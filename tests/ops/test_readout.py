@@ -70,6 +70,16 @@ def test_complete_fills_up_by_weight(rng, randn, rand):
         assert completed[cloud].tolist() == expected
 
 
+def test_complete_fills_up_by_coordinates_alone(rng, randn):
+    points = randn(4, 50, 3)
+    channels = 10 * randn(4, 50, 2)
+    indices = torch.randint(8, (4, 20), generator=rng)
+
+    completed = complete(indices, torch.cat([points, channels], 2))
+
+    assert torch.equal(completed, complete(indices, points))
+
+
 def test_complete_of_coincident_points_is_distinct():
     indices = torch.tensor([[4, 4, 2, 4, 2, 0, 0, 0]])
     points = torch.ones(1, 8, 3)

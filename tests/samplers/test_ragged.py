@@ -182,6 +182,7 @@ WRONG_BATCHES = {
     "batch and many": (MANY, [0] * 20, "with batch"),
     "batch size": (ONE, [0], r"shape \(P=20,\)"),
     "batch order": (ONE, [1] + [0] * 19, "ascending"),
+    "batch below 0": (ONE, [-1] * 10 + [0] * 10, "at least 0"),
     "batch gap": (ONE, [0] * 10 + [2] * 10, "cloud 1 has no points"),
 }
 

@@ -72,6 +72,19 @@ def test_one_cycle_equals_torch():
     assert rates(one_cycle, 51) == pytest.approx(want)
 
 
+def test_one_cycle_stays_at_its_last_rate():
+    optimizer = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
+    schedule = one_cycle(optimizer, 10)
+
+    seen = []
+    for _ in range(15):
+        seen.append(optimizer.param_groups[0]["lr"])
+        optimizer.step()
+        schedule.step()
+
+    assert seen[9:] == pytest.approx([1e-4] * 6)
+
+
 @pytest.mark.parametrize(
     ("make", "name", "value"),
     [

@@ -82,6 +82,16 @@ def test_pair_grid_draws_every_pair_before_and_after_alignment(pairs):
     assert colour_of(rings_of_target) == pytest.approx(TARGET_COLOUR)
 
 
+def test_pair_grid_draws_no_rings_where_all_points_are_given(pairs):
+    source, target, result = pairs
+    of_all_points = result._replace(source_points=result.source, target_points=target)
+
+    figure = pair_grid(source, target, [10.0, 20.0], {"full": of_all_points}, ["a", "b"])
+
+    for after in figure.axes[1::2]:
+        assert len(after.collections) == 2
+
+
 def test_pair_grid_says_angles_and_errors_of_every_pair(pairs):
     source, target, result = pairs
 

@@ -11,6 +11,7 @@ from mops_lightning.errors import UserError
 from mops_lightning.nets.layers import PointFeatures, PointMLP
 from mops_lightning.records import run_record
 from mops_lightning.samplers.mops import MOPSNet
+from mops_lightning.samplers.samplenet import SampleNet
 from mops_lightning.training.recipe.warm_start import (
     copy_pointwise_layers,
     copy_tensors,
@@ -157,6 +158,18 @@ def test_copy_tensors_takes_the_rows_that_both_have():
         assert torch.equal(rows[:8], source.queries.weight[:8])
         assert torch.equal(rows[8:], before["queries.weight"][8:])
         assert torch.equal(target.rho_local.weight, source.rho_local.weight)
+
+
+def test_copy_tensors_takes_single_numbers():
+    source = SampleNet(8)
+    target = SampleNet(4)
+    with torch.no_grad():
+        source.temperature.fill_(0.5)
+
+    copied = copy_tensors(source.state_dict(), target)
+
+    assert "temperature" in copied
+    assert target.temperature.item() == 0.5
 
 
 def test_copy_tensors_leaves_other_shapes_and_names():
