@@ -131,13 +131,17 @@ def test_generated_columns_after_normals_are_their_own(table, tmp_path):
     assert_allclose(generated["Intensity"], expected[:, 6], atol=0.51)
 
 
-def test_generated_points_without_attributes_have_coordinates_only(model, table, tmp_path):
-    source = tmp_path / "in.npz"
+@pytest.mark.parametrize("readout", ["generated", "matched"])
+@pytest.mark.parametrize("chunk", [[], ["--chunk", 70]])
+def test_points_without_attributes_have_coordinates_only(chunk, readout, model, table, tmp_path):
+    source = tmp_path / "in.ply"
     out = tmp_path / "out.npz"
     write_table(source, table)
+    settings = ["--weights", model, "--m", 9, "--readout", readout, *chunk]
 
-    done(source, out, "--weights", model, *GENERATED, "--coordinates-only")
+    done(source, out, *settings, "--coordinates-only")
 
+    assert len(contents(out).points) == 9
     assert not contents(out).columns
 
 
@@ -210,6 +214,38 @@ def test_tiles_have_the_channels_of_their_points(model, table, tmp_path):
     in_python, _ = downsample(given, 20, model, tile=100)
     assert_array_equal(kept, in_python[:, :3])
     assert not np.array_equal(kept, kept_of_changed)
+
+
+def test_classes_have_the_channels_of_their_points(model, table, tmp_path):
+    source = tmp_path / "in.npz"
+    out = tmp_path / "out.npz"
+    classes = np.repeat([5, 7], [100, 200])
+    table = table.with_columns({"class": classes})
+    write_table(source, table)
+
+    done(source, out, "--weights", model, "--m", 12, "--stratify", "class:share")
+
+    kept = contents(out)
+    for name, share in ((5, 4), (7, 8)):
+        members = table.take(np.flatnonzero(classes == name))
+        expected, _ = load(model).downsample(matrix(members, "Intensity", "ring"), share)
+        of_class = kept.points[kept.columns["class"] == name]
+        assert sorted(of_class.tolist()) == sorted(expected[:, :3].tolist())
+
+
+def test_weights_leave_out_points_with_their_channels(model, table, tmp_path):
+    source = tmp_path / "in.npz"
+    out = tmp_path / "out.npz"
+    heavy = np.arange(N) % 3 == 0
+    table = table.with_columns({"heavy": heavy.astype(np.uint8)})
+    write_table(source, table)
+
+    done(source, out, "--weights", model, "--m", 9, "--weight", "heavy")
+
+    members = table.take(np.flatnonzero(heavy))
+    expected, _ = load(model).downsample(matrix(members, "Intensity", "ring"), 9)
+    kept = contents(out).points
+    assert sorted(kept.tolist()) == sorted(expected[:, :3].tolist())
 
 
 def test_file_without_a_column_is_refused_with_what_it_has(model, table, tmp_path):

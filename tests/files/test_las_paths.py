@@ -114,6 +114,33 @@ def test_waveforms_are_refused_where_they_would_be_lost(form, name, tmp_path):
     assert f"points of format {form} refer to waveforms" in line
 
 
+@pytest.mark.parametrize("chunk", [[], ["--chunk", 90]])
+def test_generated_points_keep_the_header(chunk, folder, tmp_path):
+    scan = tmp_path / "scan.las"
+    out = tmp_path / "out.las"
+    full_cloud(6).write(scan)
+
+    done(scan, out, "--weights", folder, "--readout", "generated", "--m", 9, *chunk)
+
+    header = laspy.read(out).header
+    assert header.point_count == 9
+    assert header.file_source_id == 77
+    assert header.scales.tolist() == [0.01, 0.01, 0.001]
+
+
+@pytest.mark.parametrize("budget", [["--spacing", 30], ["--voxel", 30]])
+def test_points_of_a_spacing_and_of_voxels_keep_all_bytes(budget, tmp_path):
+    scan = tmp_path / "scan.las"
+    out = tmp_path / "out.las"
+    full_cloud(6).write(scan)
+
+    done(scan, out, *budget)
+
+    number = len(laspy.read(out).points)
+    assert 1 < number < 300
+    check_copy(scan, out, number)
+
+
 def test_points_without_attributes_have_one_return(tmp_path):
     scan = tmp_path / "scan.laz"
     out = tmp_path / "out.laz"

@@ -1,10 +1,22 @@
 """The error of a pose."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mops_lightning.files.icp.align import pose_difference
+from mops_lightning.files.icp.align import (
+    align,
+    pose_difference,
+    prepare_source,
+    prepare_target,
+    timed_error,
+)
+from mops_lightning.files.icp.measure import Setup, compare_by_icp
+from mops_lightning.files.icp.pairs import Pair, draw_motions
+from mops_lightning.seeding import derive_seed
+from tests.support.clouds import uniform_points
 
 CENTRE = np.array([1000.0, 0.0, 5.0])
 """A scan far from the origin."""
@@ -21,3 +33,51 @@ def test_pose_difference_is_the_shift_of_the_centre_not_of_the_origin():
 
     assert degrees == pytest.approx(2.0)
     assert shift == pytest.approx(0.5)
+
+
+def test_align_takes_no_correspondences_beyond_the_largest_distance():
+    points = uniform_points(300, 0)
+    target = prepare_target(points)
+    source = prepare_source(points, "gicp")
+    start = np.eye(4)
+    start[0, 3] = 0.05
+
+    near = align(target, source, start, "gicp", max_distance=1e-6)
+    far = align(target, source, start, "gicp", max_distance=0.5)
+
+    assert near == pytest.approx(start)
+    assert far == pytest.approx(np.eye(4), abs=1e-3)
+
+
+def test_score_is_the_median_over_all_starts():
+    points = uniform_points(400, 0) * [1, 1, 0.2]
+    pair = Pair(Path("scan.ply"), points[::2], points[1::2], np.eye(4))
+    setup = Setup(
+        sizes=[],
+        methods=[],
+        registrations=["plane"],
+        draws=1,
+        motions=5,
+        angle=90.0,
+        shift=0.5,
+        max_distance=0.3,
+        is_target_sampled=False,
+        seed=0,
+    )
+
+    (score,) = compare_by_icp(lambda draw: [pair], setup)
+
+    (starts,) = draw_motions([pair], 5, 90.0, 0.5, derive_seed(0, 0))
+    target = prepare_target(pair.target)
+    source = prepare_source(pair.source, "plane")
+    centre = pair.source.mean(0)
+    errors = [
+        timed_error(target, source, start, "plane", 0.3, truth=np.eye(4), centre=centre)
+        for start in starts
+    ]
+    degrees = sorted(error.degrees for error in errors)
+    shifts = sorted(error.shift for error in errors)
+    assert score.degrees == degrees[2]
+    assert score.shift == shifts[2]
+    assert score.aligned == np.mean(np.array(degrees) < 2)
+    assert (score.points, score.pairs, score.m) == (200, 5, 0)

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mops_lightning.files.icp.methods import VoxelFilter
+from mops_lightning.files.icp.methods import ByName, VoxelFilter
+from tests.support.clouds import normal_points
 
 SCAN = Path("scan.ply")
 
@@ -19,3 +20,24 @@ def test_voxels_of_small_gicp_keep_as_many_points_as_are_asked_for_where_they_ca
     rounded = eight.round(6).tolist()
     assert sorted(rounded) == sorted(corners.tolist())
     assert 1 <= len(seven) <= 7
+
+
+def test_method_by_name_depends_on_the_seed():
+    points = normal_points(200, 0)
+    method = ByName("random")
+
+    first = method.sample(points, 20, 3, SCAN).points.tolist()
+    again = method.sample(points, 20, 3, SCAN).points.tolist()
+    other = method.sample(points, 20, 4, SCAN).points.tolist()
+
+    assert first == again
+    assert sorted(first) != sorted(other)
+
+
+def test_fps_farthest_starts_at_the_point_farthest_from_the_mean():
+    points = normal_points(200, 0)
+    points[7] = [90, 0, 0]
+
+    kept = ByName("fps_farthest").sample(points, 1, 0, SCAN).points
+
+    assert kept.tolist() == [[90, 0, 0]]

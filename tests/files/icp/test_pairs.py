@@ -44,6 +44,15 @@ def test_crops_depend_on_the_seed_alone():
     assert not np.array_equal(first.source, other.source)
 
 
+def test_crops_of_two_scans_are_drawn_apart():
+    points = normal_points(500, 0)
+    scans = [(Path("a.ply"), points), (Path("b.ply"), points)]
+
+    first, second = crop_pairs(scans, 100, 1, seed=0)
+
+    assert not np.array_equal(first.source, second.source)
+
+
 def test_crops_name_a_scan_of_too_few_points():
     points = np.zeros((99, 3))
 
