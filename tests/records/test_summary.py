@@ -85,10 +85,11 @@ def test_seven_sizes_fit_eighty_columns():
 
 
 def test_task_net_alone_has_no_size():
-    corrupted = {"learn": "task", "test_corruption": "shear-3"}
+    corrupted = {"learn": "task", "test_corruption": "shear-3", "test_noise_std": 0.0}
     text = printed({"test/full/accuracy": 0.5}, "test/full/accuracy", **corrupted)
     assert "all points, test, test_corruption=shear-3" in text
     assert "m=32" not in text
+    assert "noise" not in text
 
 
 def test_sampler_with_anchors_is_named_as_in_reports():
@@ -190,6 +191,7 @@ def test_run_of_a_sampler_that_chooses_input_points_ends_in_the_methods_to_use()
     for m, sampled in ((16, 3.0), (32, 2.5)):
         metrics[f"test/m{m}/sampled/median_rotation_error_deg"] = sampled
         metrics[f"test/m{m}/fps_farthest/median_rotation_error_deg"] = 4.0
+        metrics[f"test/m{m}/random/median_rotation_error_deg"] = None  # it was not finite
 
     text = printed(metrics, "test/m32/sampled/median_rotation_error_deg", names=of_files)
 
