@@ -187,7 +187,7 @@ def test_run_on_own_files_ends_in_the_methods_to_use():
 
 def test_run_of_a_sampler_that_chooses_input_points_ends_in_the_methods_to_use():
     of_files = {**NAMES, "task": "icp", "dataset": "clouds"}
-    metrics = {"test/full/median_rotation_error_deg": 1.0}
+    metrics: dict[str, float | None] = {"test/full/median_rotation_error_deg": 1.0}
     for m, sampled in ((16, 3.0), (32, 2.5)):
         metrics[f"test/m{m}/sampled/median_rotation_error_deg"] = sampled
         metrics[f"test/m{m}/fps_farthest/median_rotation_error_deg"] = 4.0

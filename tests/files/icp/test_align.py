@@ -49,6 +49,16 @@ def test_align_takes_no_correspondences_beyond_the_largest_distance():
     assert far == pytest.approx(np.eye(4), abs=1e-3)
 
 
+def test_source_has_covariances_of_planes_for_gicp():
+    points = uniform_points(50, 0)
+
+    covariances = np.stack(prepare_source(points, "gicp").covs())
+
+    # small_gicp sets the variances to 1 along the plane, and to 0.001 across it.
+    variances = np.linalg.eigvalsh(covariances[:, :3, :3])
+    assert variances == pytest.approx(np.tile([0.001, 1, 1], (50, 1)))
+
+
 def test_score_is_the_median_over_all_starts():
     points = uniform_points(400, 0) * [1, 1, 0.2]
     pair = Pair(Path("scan.ply"), points[::2], points[1::2], np.eye(4))

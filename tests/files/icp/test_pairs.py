@@ -148,3 +148,15 @@ def test_scans_are_in_the_order_of_their_numbers(tmp_path):
     scans = scans_of(tmp_path)
 
     assert [path.name for path in scans] == ["f_9.ply", "f_10.ply"]
+
+
+def test_scans_of_folders_follow_each_other(tmp_path):
+    for name in ("b/f_1.ply", "a/f_2.ply", "a/f_10.ply"):
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        path.touch()
+
+    scans = scans_of(tmp_path)
+
+    names = [path.relative_to(tmp_path).as_posix() for path in scans]
+    assert names == ["a/f_2.ply", "a/f_10.ply", "b/f_1.ply"]
