@@ -1,7 +1,9 @@
 """The remarks below a report's tables."""
 
+import pytest
+
 from mops_lightning.report.provenance import collapses, provenance
-from tests.support.records import record
+from tests.support.records import evaluated, record
 
 
 def test_collapses_name_each_kind_once_with_the_mean_over_seeds():
@@ -25,3 +27,36 @@ def test_collapses_name_each_kind_once_with_the_mean_over_seeds():
 def test_tags_of_a_run_are_shown_with_how_it_was_made():
     (line,) = provenance([record(config={"tags": ["first", "wide"]})], "pointnet")
     assert line.endswith(", tags first wide")
+
+
+TRAINED = {"fit": 1.0, "total": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        (
+            {"seconds": TRAINED, "threads": 1, "seed": 5},
+            "- mops: 3 epochs, seed 5, cpu, 1 thread, commit 0123456789",
+        ),
+        (
+            {"seconds": TRAINED, "config": {"trainer": {"max_epochs": 1}, "learn": "joint"}},
+            "- mops, jointly trained: 1 epoch, seed 0, cpu, 2 threads, commit 0123456789",
+        ),
+        (
+            {"seconds": TRAINED, "config": {"learn": "task"}},
+            "- pointnet: 3 epochs, seed 0, cpu, 2 threads, commit 0123456789",
+        ),
+        (
+            {"evaluated": evaluated(seed=7), "git": {"commit": "a" * 40, "dirty": True}},
+            "- mops: evaluated after 9 epochs, seed 7, cpu, 2 threads, commit aaaaaaaaaa with "
+            "changes",
+        ),
+        (
+            {"device": "NVIDIA H100", "git": {"commit": None, "dirty": None}},
+            "- mops: nothing to train, seed 0, NVIDIA H100, 2 threads, commit unknown",
+        ),
+    ],
+)
+def test_provenance_says_how_a_run_was_made(changes, line):
+    assert provenance([record(**{"threads": 2, **changes})], "pointnet") == [line]
