@@ -1,3 +1,5 @@
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -100,6 +102,17 @@ def test_matrix_metrics_match_uniform_matrix(clouds):
     expected = (diagonal + off_diagonal) ** 0.5
     assert percent.tolist() == pytest.approx([100, 100, 100])
     assert_close(error, torch.full((3,), expected), atol=1e-5, rtol=1e-5)
+
+
+def test_nonzero_percent_leaves_out_entries_below_a_hundredth(clouds):
+    columns = torch.zeros(5, 40)
+    columns[:, 7] = math.log(161)  # an entry of 161/200, and 39 of 1/200
+    output = output_of_matrix(clouds, columns, 1.0)
+
+    percent = values("matrix/nonzero_percent", clouds, output)
+
+    one_of_40 = 100 / 40
+    assert percent.tolist() == pytest.approx([one_of_40, one_of_40, one_of_40])
 
 
 def test_nonzero_percent_counts_each_column(clouds):

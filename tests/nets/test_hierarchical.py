@@ -11,9 +11,15 @@ import mops_lightning as mops
 from mops_lightning.config.build import build
 from mops_lightning.config.compose import compose
 from mops_lightning.errors import UserError
-from mops_lightning.nets.hierarchical import HierarchicalNet, Stage, carried
+from mops_lightning.nets.hierarchical import (
+    HierarchicalNet,
+    HierarchicalSegmentation,
+    Stage,
+    carried,
+)
 from mops_lightning.ops.points import gather_points
 from mops_lightning.tasks.classification import Classification
+from mops_lightning.tasks.segmentation import Segmentation
 from mops_lightning.types import Batch
 
 SAMPLERS: tuple[Any, ...] = (
@@ -165,13 +171,22 @@ def test_stage_of_fewer_points_than_its_sampler_returns_is_refused(randn):
         stage(points, features)
 
 
-def test_losses_of_stages_are_part_of_the_step(randn):
+@pytest.mark.parametrize("kind", [mops.MOPSNet, mops.StageMOPSNet])
+@pytest.mark.parametrize(
+    ("make_net", "make_task"),
+    [
+        (HierarchicalNet, Classification),
+        (HierarchicalSegmentation, Segmentation),
+    ],
+)
+def test_losses_of_stages_are_part_of_the_step(make_net, make_task, kind, randn):
     torch.manual_seed(0)
-    sampler = partial(mops.MOPSNet, alpha=2.0)
-    net = HierarchicalNet(5, sampler, (20, 8), (8, 16, 16), 4)
-    task = Classification(net, 5)
+    sampler = partial(kind, alpha=2.0)
+    net = make_net(5, sampler, (20, 8), (8, 16, 16), 4)
+    task = make_task(net, 5)
     points = randn(4, 40, 3)
-    batch = Batch(points, torch.tensor([0, 1, 2, 3]))
+    parts = torch.zeros(4, 40, dtype=torch.int64)
+    batch = Batch(points, torch.tensor([0, 1, 2, 3]), None, parts)
 
     losses = task.step(batch, points).losses
     losses_in_test = task.eval().step(batch, points).losses

@@ -7,7 +7,7 @@ from torch.testing import assert_close
 
 from mops_lightning.errors import UserError
 from mops_lightning.nets.plane_icp import PlaneICP, nearest_rows, surface_normals, weighted_step
-from mops_lightning.ops.rigid import motion_of_vectors, rotation_angle
+from mops_lightning.ops.rigid import identity_motion, motion_of_vectors, rotation_angle
 from tests.ops.test_stability import box
 
 
@@ -52,6 +52,21 @@ def test_step_has_the_gradients_of_its_formula():
     arguments = [values.requires_grad_() for values in system]
 
     assert torch.autograd.gradcheck(weighted_step, arguments)
+
+
+@pytest.mark.parametrize("iterations", [1, 3])
+def test_icp_takes_as_many_steps_as_it_has_iterations(pair, iterations):
+    source, target, _ = pair
+    net = PlaneICP(iterations)
+    normals = surface_normals(target)
+    expected = identity_motion(source)
+    for _ in range(iterations):
+        expected = net.step(expected, source, target, normals)
+
+    found = net(source, target)
+
+    assert torch.equal(found.quaternion, expected.quaternion)
+    assert torch.equal(found.translation, expected.translation)
 
 
 def test_icp_finds_the_motion_between_two_samples_of_a_box(pair):

@@ -26,11 +26,13 @@ ONE_STEP: dict[str, Any] = {"limit_train_batches": 1, "limit_val_batches": 0}
 SNET: dict[str, Any] = {"feature_channels": (8, 6), "head_channels": (12,), "alpha": 2.0}
 
 
-def fitted(sampler, epochs=1, task=None, recipe=None, augment=None, others=(), **extra):
+def fitted(sampler, epochs=1, task=None, recipe=None, augment=None, others=(), seed=0, **extra):
     """Train with a rate of 0, so that all steps see the same weights, and validate each epoch."""
     data = numbered_clouds()
     task = task or RecordingTask(Fingerprint())
-    module = Experiment(task, sampler, make_optimizer=STILL, recipe=recipe, other_tasks=others)
+    module = Experiment(
+        task, sampler, make_optimizer=STILL, recipe=recipe, other_tasks=others, seed=seed
+    )
     trainer = quiet_trainer(epochs, **extra)
     train = CloudLoader(data.train, 4, shuffle=True, augment=augment, drop_last=True)
     trainer.fit(module, train, CloudLoader(data.test, 10))
@@ -352,6 +354,16 @@ def test_random_numbers_of_a_step_depend_on_epoch_and_step(calls):
     assert sizes[8:] == first_epoch + second_epoch
     assert first_epoch != second_epoch
     assert len(set(first_epoch)) > 1
+
+
+def test_random_numbers_of_a_step_depend_on_the_seed(calls):
+    for seed in (1, 2):
+        sampler = noting(FMOPSNet, 16, size_sampling="uniform", **MOPS)
+        fitted(sampler, seed=seed, limit_val_batches=0)
+
+    sizes = sizes_of(calls)
+    assert len(sizes) == 8
+    assert sizes[:4] != sizes[4:]
 
 
 def test_schedule_sets_rate_of_each_step_of_the_run():

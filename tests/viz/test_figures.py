@@ -108,6 +108,27 @@ def test_matrix_figure_shows_ideal_matrix_as_diagonal_and_every_large_entry(numb
     np.testing.assert_array_equal(drawn_gram, np.eye(4))
 
 
+def test_matrix_figure_draws_the_largest_entries_of_a_column_first():
+    dense = torch.zeros(6, 2)
+    dense[:3, 1] = torch.tensor([0.2, 0.5, 0.3])
+    dense[3:, 0] = torch.tensor([0.1, 0.6, 0.3])
+
+    figure = figures.matrix_figure(dense, dense.T @ dense, "chair")
+
+    (matrix,) = figure.axes[0].images
+    drawn = np.asarray(matrix.get_array())
+    assert drawn.max(1) == pytest.approx([0.6, 0.3, 0.1, 0.5, 0.3, 0.2])
+
+
+def test_cloud_grid_frames_a_cloud_of_equal_points():
+    points = torch.ones(1, 5, 3)
+
+    figure = figures.cloud_grid(points, {"matched": points[:, :2]}, ["a"])
+
+    axes: Any = figure.axes[0]
+    assert axes.get_xlim() == (0, 2)
+
+
 def test_cloud_grid_draws_samples_over_dense_cloud(tmp_path, randn):
     sphere = F.normalize(randn(8192, 3), dim=1)
     is_far = sphere[:, 0] < -0.3

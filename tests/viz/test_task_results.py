@@ -183,6 +183,18 @@ def test_part_grid_colours_every_cloud_by_its_own_parts_on_one_scale(randn):
     assert texts_of(figure) == ["a", "", "b", ""]
 
 
+def test_part_grid_thins_parts_as_it_thins_points(randn, monkeypatch):
+    monkeypatch.setattr(figures, "MAX_INPUT_POINTS", 10)
+    points = randn(1, 30, 3)
+    parts = torch.arange(30)[None]
+
+    figure = part_grid(points, {"true": parts}, ["a"])
+
+    (drawn,) = figure.axes[0].collections
+    assert_draws(drawn, points[0, ::3])
+    assert drawn_values(drawn).tolist() == list(range(0, 30, 3))
+
+
 def test_cloud_grid_draws_the_samples_of_every_cloud(randn):
     points = randn(2, 30, 4)
     sample = points[:, :5]
