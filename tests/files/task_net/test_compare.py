@@ -40,6 +40,7 @@ def test_scores_of_a_module_are_the_mean_losses_of_the_chosen_points(scans):
 
     whole = result.frame[result.frame.files == "all"]
     assert set(whole.method) == {"all points", "fps", "fps_farthest", "random"}
+    assert whole[whole.method == "fps"].score.nunique() == 3  # every draw has other clouds
     first_draw = whole[whole.draw == 0]
     farthest = first_draw[first_draw.method == "fps_farthest"].score.item()
     # Two halves of three files in every draw; in each, all points come first.

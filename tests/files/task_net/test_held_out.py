@@ -58,3 +58,19 @@ def test_files_that_any_run_was_trained_on_are_left_out(files):
     of_second = without_training_files(files, [second])
     assert kept == [file for file in of_first if file in of_second]
     assert len(kept) < len(of_first)
+
+
+def test_files_of_classes_that_a_run_did_not_take_are_kept(tmp_path):
+    files = []
+    for name in ("car", "tree"):
+        (tmp_path / name).mkdir()
+        for number in range(6):
+            path = tmp_path / name / f"{number}.ply"
+            path.touch()
+            files.append(path)
+    run = {"dataset": {"root": str(tmp_path), "test_share": 0.5, "classes": ["car"]}}
+
+    kept = without_training_files(files, [run])
+
+    classes = [file.parent.name for file in kept]
+    assert classes == ["car"] * 3 + ["tree"] * 6

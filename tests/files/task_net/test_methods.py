@@ -31,6 +31,24 @@ def test_saved_method_chooses_the_points_that_were_scored(name, tmp_path, rng):
     assert torch.equal(output.indices, expected)
 
 
+def test_sizes_that_were_not_compared_take_the_form_of_farthest_points_kept_most_often(
+    tmp_path, rng
+):
+    clouds = normalize_unit_sphere(torch.rand(2, 100, 3, generator=rng))
+    methods = [Untrained("fps"), Untrained(FPS_FARTHEST)]
+    choices = [
+        keep.Choice(8, "fps"),
+        keep.Choice(16, FPS_FARTHEST),
+        keep.Choice(32, FPS_FARTHEST),
+    ]
+
+    keep.save(tmp_path / "best.safetensors", choices, methods, seed=3)
+    sampler = load(tmp_path / "best")
+
+    for m, method in ((8, methods[0]), (20, methods[1])):
+        assert torch.equal(sampler(clouds, m).indices, method.rows(clouds, m, seed=3))
+
+
 ACCURACY = MetricInfo("accuracy", unit="%", scale=100.0, higher_is_better=True)
 
 
@@ -59,3 +77,24 @@ def test_method_that_is_better_on_the_first_half_alone_is_rejected():
     assert few.line == "16 points: fps; random was 10 percentage points worse on the other half"
     assert many.method == "poisson"
     assert many.line.endswith("40 percentage points better than FPS on the other half")
+
+
+def test_rejected_method_is_replaced_by_the_better_farthest_points_of_the_first_half():
+    scores = {
+        "choosing": {"fps": 0.5, FPS_FARTHEST: 0.4, "random": 0.9},
+        "checking": {"fps": 0.4, FPS_FARTHEST: 0.5, "random": 0.3},
+    }
+    rows = []
+    for draw in (0, 1):
+        for half, of_half in scores.items():
+            for name, value in of_half.items():
+                rows.append((draw, half, 16, name, value + 0.001 * draw))
+    frame = pd.DataFrame(rows, columns=["draw", "files", "m", "method", "score"])
+    methods = [Untrained(name) for name in scores["choosing"]]
+
+    (choice,) = keep.choose(frame, ACCURACY, methods)
+
+    assert (choice.method, choice.rejected) == ("fps", "random")
+    assert choice.line == (
+        "16 points: fps; random was 20 percentage points worse on the other half"
+    )
