@@ -22,6 +22,17 @@ def test_build_shows_records_and_paper(tmp_path):
     assert "pointnet on all points: 90.00 (the paper: 87.10)." in table(tmp_path)
 
 
+def test_build_with_costs_has_an_empty_cell_of_costs_in_rows_of_the_paper(tmp_path):
+    scores = {"test/sampled/accuracy": 0.3}
+    put(tmp_path, "fps", 32, scores, seconds={"fit": 2000.0, "total": 2100.0})
+
+    assert rows(table(tmp_path)) == [
+        ["sampled by", "m=32", "training (wall)"],
+        ["fps", "30.00", "2,000 s"],
+        ["*the paper's*", "34.08", ""],
+    ]
+
+
 @pytest.mark.parametrize(
     "changed",
     [

@@ -5,7 +5,8 @@ import re
 import pytest
 
 from mops_lightning.records import run_record
-from tests.support.records import evaluated
+from mops_lightning.report.rows import net_labels
+from tests.support.records import evaluated, record
 from tests.support.reports import edited, put, put_cell, put_planes, rows, table
 
 PCRNET = {"_target_": "mops_lightning.nets.pcrnet.PCRNet"}
@@ -270,6 +271,14 @@ def test_same_samples_under_several_nets_have_column_per_net(tmp_path):
         ["8", "fmops", "72.00", "32.00", "52.00"],
         ["", "all points", "90.00", "90.00", "90.00"],
     ]
+
+
+def test_nets_of_one_name_are_told_apart_by_their_weights():
+    first = record(task_weights_sha256="a" * 64)
+    second = record(task_weights_sha256="b" * 64)
+
+    assert net_labels([first, second]) == ["pointnet aaaaaaaa", "pointnet bbbbbbbb"]
+    assert net_labels([first, first]) == ["pointnet", "pointnet"]
 
 
 @pytest.mark.parametrize("columns", [3, 8, 9, 12])

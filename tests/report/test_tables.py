@@ -1,6 +1,10 @@
 import shutil
 
-from tests.support.records import NAMES, evaluated
+from mops_lightning.metrics.info import MetricInfo
+from mops_lightning.report.long_form import long_form
+from mops_lightning.report.rows import RowNames
+from mops_lightning.report.tables import over_seeds
+from tests.support.records import NAMES, evaluated, record
 from tests.support.reports import edited, put, put_cell, rows, table
 
 
@@ -40,12 +44,31 @@ def test_cells_of_several_seeds_show_mean_and_deviation(tmp_path):
     assert rows(table(tmp_path))[1][:2] == ["mops", "2 ± 1.00 / 1.5 ± 0.00 (n=3)"]
 
 
+def test_deviation_has_as_many_decimals_as_the_mean_and_at_least_two():
+    metric = MetricInfo("error", higher_is_better=False)
+
+    assert over_seeds(metric, 0.01234, 0.00123) == "0.01234 ± 0.00123"
+    assert over_seeds(metric, 12.0, 1.5) == "12 ± 1.50"
+    assert over_seeds(metric, 12.0, float("nan")) == "12"
+
+
 def test_evaluations_count_by_the_seeds_of_their_runs(tmp_path):
     for seed in (0, 1):
         metrics = {"test/generated/accuracy": 0.5 + seed / 10}
         put(tmp_path / f"{seed}", "mops", 32, metrics, evaluated=evaluated(seed=seed))
 
     assert rows(table(tmp_path))[1][1] == "55.00 ± 7.07 (n=2)"
+
+
+def test_long_form_has_the_epochs_of_the_training():
+    trained = record(folder="a", seconds={"fit": 1.0, "total": 1.0})
+    untrained = record(folder="b")
+    again = record(folder="c", evaluated=evaluated(max_epochs=9))
+    found = [trained, untrained, again]
+
+    long = long_form(found, RowNames(found, "pointnet"))
+
+    assert long.epochs.tolist() == [3, 0, 9]
 
 
 def test_later_of_two_equal_runs_counts(tmp_path):
