@@ -10,7 +10,7 @@ from torch.testing import assert_close
 
 from mops_lightning.channels import Channel, PointChannels
 from mops_lightning.data.clouds import Clouds
-from mops_lightning.data.corruptions import KINDS, corrupt
+from mops_lightning.data.corruptions import KINDS, _split, corrupt
 from mops_lightning.errors import UserError
 from mops_lightning.seeding import generator
 
@@ -507,3 +507,13 @@ def test_linear_map_keeps_normals_normal_to_the_surface(clouds, kind):
         assert products.abs().max() < 1e-4
         lengths = normals.norm(dim=1)
         assert_close(lengths, torch.ones(N))
+
+
+def test_local_corruptions_divide_their_points_among_any_of_one_to_eight_places():
+    numbers = set()
+    for seed in range(60):
+        sizes = _split(1000, torch.Generator().manual_seed(seed))
+        numbers.add(len(sizes))
+        assert sum(sizes) == 1000
+
+    assert numbers == {1, 2, 3, 4, 5, 6, 7, 8}

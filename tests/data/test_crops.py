@@ -129,3 +129,13 @@ def test_tiles_of_as_many_points_as_a_tile_are_the_whole_cloud():
     assert tiles.own is not None
     assert tiles.own.all()
     assert tiles.rows.tolist() == [list(range(50))]
+
+
+def test_random_crops_whole_is_in_random_order():
+    points = cloud(50)
+    rng = np.random.default_rng(0)
+
+    rows = random_crops(points, None, 1, "whole", rng, PATH).rows[0].tolist()
+
+    assert sorted(rows) == list(range(50))
+    assert rows != sorted(rows)

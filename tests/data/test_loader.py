@@ -408,3 +408,22 @@ def test_loader_continues_from_a_saved_position_with_the_rest_of_the_epoch(numbe
 
     assert labels(resumed) == epoch[number_seen:]
     assert len(labels(resumed)) == 3
+
+
+def test_loader_parts_of_points_belong_to_the_clouds_of_its_process():
+    parts = torch.arange(70).view(10, 7)
+    split = clouds()._replace(parts=parts)
+
+    for rank in (0, 1):
+        for batch in CloudLoader(split, 4, shuffle=True, part=(rank, 2)):
+            assert torch.equal(batch.parts, parts[batch.rows])
+            assert torch.equal(batch.points, split.points[batch.rows])
+
+
+def test_loader_begins_another_epoch_at_its_first_batch_after_a_saved_position():
+    loader = CloudLoader(clouds(), 4)
+    loader.load_state_dict({"epoch": 0, "position": 2})
+
+    loader.set_epoch(1)
+
+    assert labels(loader) == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9]]
