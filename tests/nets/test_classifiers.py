@@ -1,5 +1,6 @@
 """What is specific to classifiers; see test_contract for what all nets guarantee."""
 
+from functools import partial
 from typing import Any
 
 import pytest
@@ -7,10 +8,12 @@ import torch
 from torch.testing import assert_close
 
 from mops_lightning.nets.dgcnn import DGCNN
+from mops_lightning.nets.hierarchical import HierarchicalNet, HierarchicalSegmentation
 from mops_lightning.nets.pointnet import PointNetTransform, PointNetVanilla, TransformNet
 from mops_lightning.ops import compiled
 from mops_lightning.ops.maxima import max_of_rows
 from mops_lightning.ops.points import gather_points
+from mops_lightning.samplers.fps import FPSSampler
 
 
 def test_transform_net_starts_at_identity(randn):
@@ -28,8 +31,16 @@ CLASSIFIERS = [
     DGCNN,
 ]
 
+SMALL: dict[str, Any] = {
+    "sampler": FPSSampler,
+    "points": (20, 8),
+    "channels": (8, 16, 16),
+    "k": 4,
+}
+HIERARCHICAL = [partial(net, **SMALL) for net in (HierarchicalNet, HierarchicalSegmentation)]
 
-@pytest.mark.parametrize("classifier", CLASSIFIERS)
+
+@pytest.mark.parametrize("classifier", [*CLASSIFIERS, *HIERARCHICAL])
 def test_dropout_has_its_probability_and_acts_in_training(classifier, randn):
     points = randn(4, 30, 3)
     net = classifier(5, dropout=0.25).train()
