@@ -52,6 +52,13 @@ def test_factory_baseline_has_the_seed_of_the_run_or_its_own():
         assert torch.equal(baseline(points).points, expected)
 
 
+def test_factory_baseline_returns_the_largest_tested_size():
+    made = experiment("sampler=fmops", "sampler.m_max=16", "sizes=[4,16]")
+
+    assert made.sizes == (4, 8, 16)
+    assert made.baselines["random"].m == 16
+
+
 def test_factory_refuses_start_of_a_baseline_outside_of_the_clouds():
     cfg = compose(["+baselines.fps.start=5000", "m=8"])  # not only when a trained run is tested
     with pytest.raises(UserError, match=r"baselines\.fps: start must be less than .* N=48"):
