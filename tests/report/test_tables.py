@@ -1,6 +1,7 @@
 import shutil
 
 from mops_lightning.metrics.info import MetricInfo
+from mops_lightning.report.collect import sampler_row
 from mops_lightning.report.long_form import long_form
 from mops_lightning.report.rows import RowNames
 from mops_lightning.report.tables import over_seeds
@@ -80,6 +81,20 @@ def test_later_of_two_equal_runs_counts(tmp_path):
     text = table(tmp_path)
     assert ["fps", "40.00"] in rows(text)
     assert f"- {tmp_path}/b/fps-32-pointnet: not shown" in text
+
+
+def test_own_run_counts_though_a_baseline_is_later(tmp_path):
+    first = "2026-01-01T02:00:00+00:00"
+    second = "2026-01-01T03:00:00+00:00"
+    scores = {"test/generated/accuracy": 0.5, "test/fps/accuracy": 0.2}
+    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3}, started=first)
+    put(tmp_path, "mops", 32, scores, started=second)
+
+    assert our_rows(table(tmp_path))[1:] == [["fps", "30.00"], ["mops", "50.00"]]
+
+
+def test_row_of_a_sampler_trained_under_several_nets_has_their_number():
+    assert sampler_row(record(config={"other_nets": {"dgcnn": {}}})) == "mops 2 nets"
 
 
 def test_best_is_bold_and_second_underlined(tmp_path):
