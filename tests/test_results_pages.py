@@ -122,7 +122,8 @@ def small(arguments: list[str], roots: Path, sweep: str = "") -> list[str]:
     else:
         data = ["dataset.train_per_class=1", "dataset.test_per_class=1"]
     if "dataset.n_points" in text:
-        data.append(f"dataset.n_points={POINTS}")
+        sizes = [int(argument.removeprefix("m=")) for argument in chosen if argument.startswith("m=")]
+        data.append(f"dataset.n_points={max([POINTS, *sizes])}")
     replaced = {key_of(argument) for argument in data} | {"trainer", "dataset.root"}
     if "evaluate=" in text:  # a model in place of a run on shapes
         replaced.add("dataset.train_per_class")
@@ -210,7 +211,8 @@ def test_table_comes_from_its_records_by_its_command(command, monkeypatch):
 def test_comparison_of_a_page_is_understood(command):
     chosen = compare_arguments(command.arguments[1:], "compare")
 
-    assert chosen.task == "icp"
+    expected = "icp" if "--task" in command.arguments else "coverage"
+    assert chosen.task == expected
     assert chosen.m
 
 
