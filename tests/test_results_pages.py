@@ -122,7 +122,7 @@ def small(arguments: list[str], roots: Path, sweep: str = "") -> list[str]:
     else:
         data = ["dataset.train_per_class=1", "dataset.test_per_class=1"]
     if "dataset.n_points" in text:
-        sizes = [int(argument.removeprefix("m=")) for argument in chosen if argument.startswith("m=")]
+        sizes = [int(one.removeprefix("m=")) for one in chosen if one.startswith("m=")]
         data.append(f"dataset.n_points={max([POINTS, *sizes])}")
     replaced = {key_of(argument) for argument in data} | {"trainer", "dataset.root"}
     if "evaluate=" in text:  # a model in place of a run on shapes
