@@ -9,6 +9,8 @@ import hydra.utils
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
+from mops_lightning.config.compose import compose
+
 CONF = Path(__file__).parents[2] / "conf"
 
 DIFFERENT = {
@@ -68,3 +70,20 @@ def test_values_of_a_group_are_the_defaults_of_its_class(file):
             different.add(name)
 
     assert different == DIFFERENT.get(file, set())
+
+
+@pytest.mark.parametrize(
+    ("dataset", "seed"),
+    [
+        ("clouds", 7),
+        ("mesh_sequence", 7),
+        ("meshes", 7),
+        ("scans_of_shapes", 7),
+        ("shapes", 7),
+        ("shapenet_core", 0),  # one split for all seeds
+    ],
+)
+def test_seed_of_a_data_set_is_the_runs_but_for_published_splits(dataset, seed):
+    cfg = compose([f"dataset={dataset}", "seed=7"])
+
+    assert cfg.dataset.seed == seed

@@ -278,6 +278,17 @@ def test_cutout_cuts_whole_neighbourhoods(clouds):
         assert gone.sum() == 2 * hole
 
 
+def test_density_down_thins_a_neighbourhood_in_place_of_cutting_a_hole(clouds):
+    number_gone = round(0.75 * (N // 10))
+    for s in range(4):
+        gone = removed(clouds, "density_down-1", s)
+
+        holes = neighbourhoods(clouds.points[s], number_gone)
+        is_hole = (holes == gone).all(1)
+        assert gone.sum() == number_gone
+        assert not is_hole.any()
+
+
 def test_density_changes_inside_or_outside_of_one_neighbourhood(clouds):
     size = N // 10
     for s in range(4):
