@@ -3,7 +3,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from mops_lightning.errors import UserError
-from mops_lightning.ops.readout import complete, match, unique_count
+from mops_lightning.ops.readout import complete, match, select, unique_count
 from tests.support.plain import plain_farthest
 
 
@@ -68,6 +68,22 @@ def test_complete_fills_up_by_weight(rng, randn, rand):
     for cloud in range(4):
         expected = plain_complete(indices[cloud], points[cloud], weight[cloud])
         assert completed[cloud].tolist() == expected
+
+
+def test_select_of_completed_sets_fills_up_by_weight(randn, rand):
+    points = randn(4, 50, 3, dtype=torch.float64)
+    generated = points[:, :1] + 0.01 * randn(4, 12, 3, dtype=torch.float64)  # few different matches
+    weight = rand(4, 50)
+
+    completed, rows = select(points, generated, "completed", weight)
+
+    matched = match(generated, points)
+    for cloud in range(4):
+        expected = plain_complete(matched[cloud], points[cloud], weight[cloud])
+        unweighted = plain_complete(matched[cloud], points[cloud])
+        assert rows[cloud].tolist() == expected
+        assert rows[cloud].tolist() != unweighted
+        assert torch.equal(completed[cloud], points[cloud][expected])
 
 
 def test_complete_fills_up_by_coordinates_alone(rng, randn):
