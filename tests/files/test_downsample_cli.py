@@ -18,6 +18,7 @@ GENERATED = ["--weights", "weights.safetensors", "--readout", "generated"]
         (["--method", "fps"], "--m must be"),
         (["--m", 0, "--method", "fps"], "--m must be"),
         (["--m", 41, "--weights", "weights.safetensors"], "trained for up to 40 points, got 41"),
+        (["--m", 41, "--weights", "weights.safetensors"], "or train with sampler.m_max=41"),
         (["--weights", "task.pt"], "holds a task net"),
         (["--weights", "nowhere.pt"], "--weights: no file nowhere.pt"),
         (["--m", 500, "--method", "fps"], "holds 299 points, fewer than --m 500"),

@@ -102,14 +102,11 @@ def _check_size(sampler: Sampler, options: Options, m: int | None) -> None:
     if m is None or m == sampler.m or (is_smaller and sampler.flexible):
         return
     allowed = f"{sampler.m}"
-    advice = f"Give --m {sampler.m}"
+    advice = f"Give --m {sampler.m}, or train with m={m}"
     if sampler.flexible:
         allowed = f"up to {sampler.m}"
-        advice = f"Give --m {sampler.m} or less"
-    raise UserError(
-        f"--m: {options.weights} was trained for {allowed} points, got {m}. {advice}, or train "
-        f"with m={m}."
-    )
+        advice = f"Give --m {sampler.m} or less, or train with sampler.m_max={m}"
+    raise UserError(f"--m: {options.weights} was trained for {allowed} points, got {m}. {advice}.")
 
 
 def downsample_file(
