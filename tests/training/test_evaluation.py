@@ -14,6 +14,7 @@ from mops_lightning.config.overrides import readable
 from mops_lightning.errors import UserError
 from mops_lightning.training.as_trained import as_trained, lost_baselines
 from mops_lightning.training.evaluation import TrainedRun, command_line
+from mops_lightning.training.run import run as running
 from tests.support.command_line import TINY
 from tests.support.records import record
 
@@ -88,7 +89,7 @@ def test_evaluation_repeats_removed_and_added_baselines(given, tmp_path):
     assert evaluated(run, start).baselines.fps == compose([*OVERRIDES, start]).baselines.fps
 
 
-def test_baselines_of_an_experiment_are_named_as_lost(tmp_path):
+def test_baselines_of_an_experiment_are_named_as_lost_with_what_adds_them(tmp_path, capsys):
     added = {"_target_": "mops_lightning.samplers.fps.FPSSampler", "start": "farthest"}
     with_one_more = {**composed(*OVERRIDES)["baselines"], "fps_farthest": added}
     run = write_run(tmp_path / "run", changes={"baselines": with_one_more})
@@ -96,8 +97,13 @@ def test_baselines_of_an_experiment_are_named_as_lost(tmp_path):
     cfg = evaluated(run)
 
     lost = lost_baselines(cfg, trained, [f"evaluate={run}"])
+    running._say_lost_baselines(lost, trained)
 
+    adding = ["+sampler@baselines.fps_farthest=fps", "+baselines.fps_farthest.start=farthest"]
     assert lost == ["fps_farthest"]
+    assert " ".join(adding).replace("=fps ", "=SAMPLER ") in capsys.readouterr().out
+    again = evaluated(run, *adding).baselines.fps_farthest
+    assert added.items() <= again.items()
     assert lost_baselines(cfg, trained, ["baselines={}"]) == []
     assert lost_baselines(cfg, trained, ["baselines.fps=null"]) == []
 

@@ -59,7 +59,7 @@ def run_in(folder: Path, cfg: DictConfig, overrides: list[str]) -> RunRecord:
     trained = TrainedRun.read(cfg.evaluate) if cfg.evaluate else None
     writes = not distributed.is_worker_rank(cfg)
     if trained and writes:
-        _say_lost_baselines(lost_baselines(cfg, trained, overrides), trained.name)
+        _say_lost_baselines(lost_baselines(cfg, trained, overrides), trained)
     settings: Any = OmegaConf.to_container(cfg, resolve=True)
     with sigterm_as_ctrl_c(), recorded(settings, folder, overrides, writes) as record:
         with record.timed("data"):
@@ -88,13 +88,19 @@ def checked(cfg: DictConfig, overrides: list[str]) -> DictConfig:
     return cfg
 
 
-def _say_lost_baselines(names: list[str], run_name: str) -> None:
-    if names:
-        print(
-            f"Not tested here: {', '.join(names)}, which an experiment had added to the baselines "
-            f"of {run_name}. +sampler@baselines.{names[0]}=SAMPLER adds it.",
-            flush=True,
-        )
+def _say_lost_baselines(names: list[str], trained: TrainedRun) -> None:
+    if not names:
+        return
+    name = names[0]
+    adding = [f"+sampler@baselines.{name}=SAMPLER"]
+    for setting, value in trained.record.config["baselines"][name].items():
+        if setting != "_target_":
+            adding.append(f"+baselines.{name}.{setting}={value}")
+    print(
+        f"Not tested here: {', '.join(names)}, which an experiment had added to the baselines "
+        f"of {trained.name}. {' '.join(adding)} adds it.",
+        flush=True,
+    )
 
 
 def claim(folder: Path) -> None:
