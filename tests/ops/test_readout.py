@@ -78,6 +78,7 @@ def test_select_of_completed_sets_fills_up_by_weight(randn, rand):
     completed, rows = select(points, generated, "completed", weight)
 
     matched = match(generated, points)
+    assert rows is not None
     for cloud in range(4):
         expected = plain_complete(matched[cloud], points[cloud], weight[cloud])
         unweighted = plain_complete(matched[cloud], points[cloud])
