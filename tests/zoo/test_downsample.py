@@ -26,6 +26,21 @@ def test_seed_and_start_are_used_and_fps_is_the_default():
     assert torch.equal(downsample(CLOUD, 20)[1], downsample(CLOUD, 20, method="fps")[1])
 
 
+@pytest.mark.parametrize("method", ["fps", "random", "serial", "voxel", "poisson"])
+@pytest.mark.parametrize("other", [10, 25])
+def test_rows_of_all_points_do_not_depend_on_the_clouds_beside(method, other):
+    cloud = CLOUD[:10]
+    clouds = [cloud, CLOUD[10 : 10 + other]]
+    batch = torch.tensor([0] * 10 + [1] * other)
+
+    _, alone = downsample(cloud, 10, method)
+
+    _, of_list = downsample(clouds, 10, method)
+    _, of_flat = downsample(torch.cat(clouds), 10, method, batch=batch)
+    assert torch.equal(of_list[0], alone)
+    assert torch.equal(of_flat[:10], alone)
+
+
 def test_model_equals_its_sampler():
     points, indices = downsample(CLOUD.numpy(), 20, "fmops.modelnet40-m512")
     expected = load("fmops.modelnet40-m512").downsample(CLOUD, 20)

@@ -214,7 +214,7 @@ def to_number(
     samples = []
     for number, (cloud, size) in enumerate(zip(clouds.clouds, sizes, strict=True)):
         available = len(cloud.points)
-        if available <= size and may_be_small:
+        if available < size and may_be_small:
             samples.append(cloud.rows(np.arange(available)))
         elif available < size:
             raise UserError(f"m must be at most the number of points N={available}, got m={size}.")
