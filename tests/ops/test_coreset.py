@@ -195,6 +195,20 @@ def test_same_sum_of_numbers_on_a_line_is_two_of_them():
     assert total == pytest.approx(4950)
 
 
+@pytest.mark.parametrize("keep", [5, 12, 100])
+def test_same_sum_is_exact_for_numbers_of_very_different_sizes(keep):
+    numbers = np.random.default_rng(4).uniform(1, 2, (500, 4))
+    vectors = numbers * [1e-12, 1.0, 1e12, 1e-3]
+
+    rows, weights = same_sum(vectors, keep)
+
+    assert 0 < len(rows) <= keep
+    assert (np.diff(rows) > 0).all()
+    assert (weights > 0).all()
+    assert weights.sum() == pytest.approx(500, rel=1e-9)
+    np.testing.assert_allclose(weights @ vectors[rows], vectors.sum(0), rtol=1e-9)
+
+
 UNKNOWN_SHIFT = pose_of([0, 0, 0], [0, np.nan, 0])
 
 
