@@ -112,6 +112,20 @@ def test_points_beyond_the_distance_have_no_effect(pair):
     assert_close(found.quaternion, expected.quaternion)
 
 
+@pytest.mark.parametrize(("max_distance", "has_effect"), [(0.25, True), (0.15, False)])
+def test_points_up_to_the_distance_have_an_effect(pair, max_distance, has_effect):
+    _, target, _ = pair
+    x = target[0, :, 0]
+    off_a_face = target[:, x > x.max() - 0.01] + torch.tensor([0.2, 0.0, 0.0])
+    with_others = torch.cat([target, off_a_face], 1)
+
+    found = PlaneICP(3, max_distance)(with_others, target)
+
+    alone = PlaneICP(3, max_distance)(target, target)
+    apart = (found.translation - alone.translation).norm()
+    assert (apart > 0.001) == has_effect
+
+
 def test_gradients_flow_through_the_last_step_only(pair):
     source, target, _ = pair
     source.requires_grad_()

@@ -1,6 +1,7 @@
 """A run that is stopped and resumed, also several times, gets the weights of an unbroken one."""
 
 import io
+import os
 import pickle
 import signal
 from functools import cache, partial
@@ -18,7 +19,14 @@ from mops_lightning.data.loader import Augmentation, CloudLoader
 from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.samplers.mops import MOPSNet
 from mops_lightning.tasks.classification import Classification
-from mops_lightning.training.checkpoint import read_sealed, sealed
+from mops_lightning.training.checkpoint import (
+    CHECKPOINT,
+    CHECKPOINT_KEY,
+    LENGTH,
+    find_checkpoint,
+    read_sealed,
+    sealed,
+)
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.muon import MuonAdam
 from mops_lightning.training.recipe.moving_average import MovingAverage
@@ -293,3 +301,30 @@ def test_read_sealed_of_a_changed_checkpoint_raises(change, tmp_path):
 
     with pytest.raises(UserError, match=r"last\.ckpt is damaged .*expected a checkpoint as"):
         read_sealed(path)
+
+
+@pytest.mark.parametrize("newest", ["a", "b", "c"])
+def test_last_is_the_newest_run_with_these_settings(newest, tmp_path):
+    identity = {"sampler": "fps", LENGTH: "9"}
+    for number, name in enumerate("abcd"):
+        path = tmp_path / name / "checkpoints" / CHECKPOINT
+        path.parent.mkdir(parents=True)
+        identity_of_run = identity
+        written_at = 1000 + number
+        if name == "d":
+            identity_of_run = {**identity, "sampler": "random"}
+            written_at = 3000
+        elif name == newest:
+            written_at = 2000
+        loop = {"epoch_progress": {"current": {"processed": 3}}}
+        content = {
+            CHECKPOINT_KEY: identity_of_run,
+            "loops": {"fit_loop": loop},
+            "global_step": 12,
+        }
+        AtomicCheckpointIO().save_checkpoint(content, path)
+        os.utime(path, (written_at, written_at))
+
+    found = find_checkpoint("last", tmp_path, identity)
+
+    assert found.path.parts[-3] == newest
