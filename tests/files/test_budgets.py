@@ -109,6 +109,18 @@ def test_total_keeps_a_point_of_every_file(m, sizes, tmp_path):
     assert sizes_of(out) == sizes
 
 
+def test_total_of_the_rest_of_a_folder_is_that_of_the_whole_folder(clouds, tmp_path):
+    arguments = [clouds, tmp_path, "--method", "random", "--m", 50, "--total"]
+    done(*arguments)
+    (rest,) = tmp_path.glob("**/b.*")
+    rest.unlink()
+
+    out = done(*arguments)
+
+    assert sizes_of(tmp_path) == {"a": 30, "b": 15, "c": 5}
+    assert "1 done" in out
+
+
 def test_total_lists_broken_files_and_goes_on(tmp_path):
     source = tmp_path / "in"
     result = tmp_path / "out"
