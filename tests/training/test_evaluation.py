@@ -91,7 +91,8 @@ def test_evaluation_repeats_removed_and_added_baselines(given, tmp_path):
 
 def test_baselines_of_an_experiment_are_named_as_lost_with_what_adds_them(tmp_path, capsys):
     added = {"_target_": "mops_lightning.samplers.fps.FPSSampler", "start": "farthest"}
-    with_one_more = {**composed(*OVERRIDES)["baselines"], "fps_farthest": added}
+    known = composed(*OVERRIDES)["baselines"]
+    with_one_more = {**known, "fps_farthest": added, "removed": None}
     run = write_run(tmp_path / "run", changes={"baselines": with_one_more})
     trained = TrainedRun.read(str(run))
     cfg = evaluated(run)

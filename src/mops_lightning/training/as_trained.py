@@ -71,7 +71,8 @@ def lost_baselines(cfg: DictConfig, trained: TrainedRun, arguments: list[str]) -
     if trained.trained_task_net or any(_is_of_baselines(argument) for argument in arguments):
         return []
     known = trained.record.config.get("baselines") or {}
-    return [name for name in known if name not in (cfg.baselines or {})]
+    tested = cfg.baselines or {}
+    return [name for name, sampler in known.items() if sampler and name not in tested]
 
 
 def _is_of_baselines(argument: str) -> bool:
