@@ -45,22 +45,21 @@ def seeded_keys(points: Array, order: SeededOrder) -> NDArray[np.int64]:
     Returns:
         ``(B, N)`` int64.
     """
-    clouds, number, channels = points.shape
-    flat = np.ascontiguousarray(points).reshape(-1)
-    keys: NDArray[np.int64] = kernel_keys.keys_of(
-        flat, clouds, channels, seed_word(order.seed), order.in_sphere, True
-    )
-    return keys.reshape(clouds, number)
+    return _keys(points, order, distinct=True)
 
 
 def point_hashes(points: Array, order: SeededOrder) -> NDArray[np.int64]:
-    """Return the keys ``(B, N)`` of points ``(B, N, C)``, in which copies have the same key."""
+    """Return keys ``(B, N)`` as ``seeded_keys``, but one key for all copies of a point."""
+    return _keys(points, order, distinct=False)
+
+
+def _keys(points: Array, order: SeededOrder, *, distinct: bool) -> NDArray[np.int64]:
     clouds, number, channels = points.shape
     flat = np.ascontiguousarray(points).reshape(-1)
-    hashes: NDArray[np.int64] = kernel_keys.keys_of(
-        flat, clouds, channels, seed_word(order.seed), order.in_sphere, False
+    keys: NDArray[np.int64] = kernel_keys.keys_of(
+        flat, clouds, channels, seed_word(order.seed), order.in_sphere, distinct
     )
-    return hashes.reshape(clouds, number)
+    return keys.reshape(clouds, number)
 
 
 def seed_word(seed: int) -> np.uint64:

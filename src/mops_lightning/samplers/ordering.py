@@ -5,6 +5,7 @@ order of its points. Here, points are ordered by a hash of their coordinates, th
 cloud.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -46,31 +47,32 @@ def seeded_order(points: Tensor, seed: int, in_sphere: bool = False) -> Tensor:
     return random.argsort(dim=1, stable=True)
 
 
-def seeded_hashes(points: Tensor, seed: int, in_sphere: bool = False) -> Tensor:
-    """Return random keys ``(B, N)`` int64 as ``seeded_keys``, but one key for all copies."""
-    given = points.detach()
-    if given.is_cpu:
-        order = SeededOrder(seed, in_sphere)
-        return torch.from_numpy(keys.point_hashes(numbers_of(given), order))
-    if in_sphere:
-        given = in_unit_sphere(given)
-    return point_hashes(given, seed)
-
-
 def seeded_keys(points: Tensor, seed: int, in_sphere: bool = False) -> Tensor:
     """Return the random keys ``(B, N)`` int64 whose order is ``seeded_order``."""
+    order = SeededOrder(seed, in_sphere)
+    return _on_its_device(points, order, keys.seeded_keys, _keys_on_device)
+
+
+def seeded_hashes(points: Tensor, seed: int, in_sphere: bool = False) -> Tensor:
+    """Return random keys ``(B, N)`` int64 as ``seeded_keys``, but one key for all copies."""
+    order = SeededOrder(seed, in_sphere)
+    return _on_its_device(points, order, keys.point_hashes, point_hashes)
+
+
+def _on_its_device(
+    points: Tensor,
+    order: SeededOrder,
+    in_loops: Callable[[NDArray[Any], SeededOrder], NDArray[np.int64]],
+    in_torch: Callable[[Tensor, int], Tensor],
+) -> Tensor:
+    """Compute keys by the compiled loops on a CPU, in torch elsewhere."""
     given = points.detach()
     if given.is_cpu:
-        order = SeededOrder(seed, in_sphere)
-        return torch.from_numpy(keys.seeded_keys(numbers_of(given), order))
-    if in_sphere:
+        numbers = given.to(distance_dtype(given)).numpy()
+        return torch.from_numpy(in_loops(numbers, order))
+    if order.in_sphere:
         given = in_unit_sphere(given)
-    return _keys_on_device(given, seed)
-
-
-def numbers_of(points: Tensor) -> NDArray[Any]:
-    """Return points on a CPU as an array of float32 or float64."""
-    return points.detach().to(distance_dtype(points)).numpy()
+    return in_torch(given, order.seed)
 
 
 def _keys_on_device(points: Tensor, seed: int) -> Tensor:

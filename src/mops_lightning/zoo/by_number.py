@@ -214,10 +214,11 @@ def to_number(
     samples = []
     for number, (cloud, size) in enumerate(zip(clouds.clouds, sizes, strict=True)):
         available = len(cloud.points)
-        if available < size and may_be_small:
-            samples.append(cloud.rows(np.arange(available)))
-        elif available < size:
+        is_small = available < size
+        if is_small and not may_be_small:
             raise UserError(f"m must be at most the number of points N={available}, got m={size}.")
+        if is_small:
+            samples.append(cloud.rows(np.arange(available)))
         elif classes is None:
             samples.append(choice.sample(cloud, size))
         else:
