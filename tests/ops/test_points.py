@@ -3,7 +3,21 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from mops_lightning.ops.points import UnitSphere, gather_points, normalize_unit_sphere
+from mops_lightning.errors import UserError
+from mops_lightning.ops.points import (
+    UnitSphere,
+    as_tensor,
+    gather_points,
+    normalize_unit_sphere,
+)
+
+COMPLEX = np.array([[1 + 2j, 3, 4]])
+
+
+@pytest.mark.parametrize("points", [COMPLEX, torch.from_numpy(COMPLEX)])
+def test_as_tensor_refuses_complex_numbers(points):
+    with pytest.raises(UserError, match=r"points must hold real numbers, got torch\.complex128"):
+        as_tensor("points", points)
 
 
 def test_gather_points_equals_double_loop(rng, randn):

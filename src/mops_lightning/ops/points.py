@@ -16,7 +16,18 @@ BLOCK = 16384
 
 
 def as_tensor(name: str, value: Any) -> Tensor:
-    """Return a tensor of an argument: a tensor, an array, or a list of whole numbers."""
+    """Return a tensor of an argument: a tensor, an array, or a list of whole numbers.
+
+    Raises:
+        UserError: it holds no numbers, or complex ones.
+    """
+    tensor = _converted(name, value)
+    if tensor.is_complex():
+        raise UserError(f"{name} must hold real numbers, got {tensor.dtype}. Try {name}.real.")
+    return tensor
+
+
+def _converted(name: str, value: Any) -> Tensor:
     if isinstance(value, np.ndarray):
         native = value.astype(value.dtype.newbyteorder("="), copy=False)  # files may be big-endian
         try:
