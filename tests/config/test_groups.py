@@ -75,6 +75,7 @@ sampler=fmops: sampler.alpha=30.0 sampler.tau_min=0.1 sampler.m_max=512 optimize
 sampler=fmops recipe=paper: sampler.size_sampling=uniform
 task=registration: sampler.alpha=1.0 sampler.tau_min=0.1 task_lr_scale=0.1
 task=registration: epochs.task=6 epochs.sampler=6
+task=registration: names.net=pcrnet task.net.iterations=2
 task=registration sampler=fmops: sampler.alpha=1.0 sampler.tau_min=0.1 sampler.anchors=framed
 task=registration sampler=fmops: sampler.m_max=64 recipe.train_points=256 recipe.warm_start=True
 task=registration sampler=fmops: sampler.anchors=framed sampler.anchor_width=2.0
@@ -84,12 +85,25 @@ task=registration sampler=fmops: weights=auto pretrain_from=pcrnet.modelnet40 op
 task=registration sampler=fmops recipe=paper: sampler.anchors=None sampler.m_max=64
 task=registration sampler=fmops recipe=paper: optimizer.lr=0.001
 task=reconstruction: sampler.alpha=0.2 sampler.tau_min=0.5
+task=reconstruction: names.net=autoencoder
+task=segmentation: names.net=hierarchical_segmentation task.net.sampler.m=32
+task=icp dataset=clouds dataset.root=x: names.net=plane_icp
 task=reconstruction sampler=fmops: sampler.alpha=0.2 sampler.tau_min=0.5
 sampler=snet: optimizer.lr=0.01 pretrain.lr=0.001
 sampler=snet optimizer=exponential: optimizer.lr=0.0005
 learn=joint sampler=snet: optimizer.lr=0.01 pretrain.lr=0.001
 task=registration sampler=snet: optimizer.lr=0.001 pretrain.lr=0.0005
 task=reconstruction sampler=snet: optimizer.lr=0.0005 pretrain.lr=0.001
+task=registration sampler=snet: sampler.alpha=0.01 sampler.output_norm=False sampler.coverage=1.0
+task=reconstruction sampler=snet: sampler.alpha=0.01 sampler.coverage=0.0 sampler.head_norm=False
+task=registration sampler=samplenet: sampler.alpha=0.01 sampler.k=8 sampler.beta=0.01
+task=registration sampler=samplenet_progressive: sampler.alpha=0.01 sampler.k=8
+task=registration sampler=samplenet_progressive: sampler.coverage=1.0 sampler.size_reduction=mean
+task=reconstruction sampler=samplenet: sampler.alpha=0.01 sampler.coverage=0.0 sampler.k=16
+task=reconstruction sampler=samplenet_progressive: sampler.alpha=0.01 sampler.coverage=0.0
+task=reconstruction sampler=samplenet_progressive: sampler.k=16 sampler.min_size=16
+task=registration sampler=fmops: sampler.num_sizes=2 sampler.min_size=8
+sampler=fmops: sampler.num_sizes=4 sampler.min_size=8 sampler.size_sampling=nested
 sampler=samplenet_progressive: sampler.m_max=1024 sampler.min_size=2 sampler.size_reduction=sum
 sampler=samplenet_progressive: sampler.coverage=0.5 sampler.coverage_per_point=0.03333333333333333
 dataset=modelnet40: epochs.task=30 epochs.sampler=8
@@ -105,6 +119,8 @@ experiment=classification_paper sampler=fmops: sampler.size_sampling=uniform
 experiment=classification_snet sampler=samplenet: sampler.k=7 sampler.beta=1.0 sampler.alpha=30.0
 experiment=classification_snet sampler=samplenet: sampler.sigma_min=0.0 sampler.coverage=1.0
 experiment=classification_snet sampler=samplenet: sampler.coverage_per_point=0.0 optimizer.lr=0.01
+experiment=classification_snet sampler=samplenet: optimizer.schedule.every=18750
+experiment=classification_snet sampler=samplenet: optimizer.schedule.floor_lr=1e-05 pretrain.lr=0.001
 experiment=classification_snet sampler=samplenet: trainer.max_epochs=500 val_fraction=0.0
 """
 """Settings, and the values that others have then."""
