@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from mops_lightning.errors import UserError
-from mops_lightning.ops.flat_fps import fps
+from mops_lightning.ops.flat_fps import _on_device, fps
+from mops_lightning.ops.fps import farthest_point_sample
 
 
 def torch_cluster_fps(x, batch, ratio):
@@ -56,6 +57,38 @@ def test_flat_fps_equals_torch_cluster(sizes, ratio, shape, randn):
     if number == 1:
         without_batch = fps(x, ratio=ratio, random_start=False)
         assert torch.equal(rows, without_batch)
+
+
+@pytest.mark.parametrize("sizes", [(40,), (30, 30), (50, 1, 0, 27)])
+@pytest.mark.parametrize("kind", ["floats", "whole numbers", "without channels"])
+def test_flat_fps_in_the_form_for_gpus_equals_that_for_cpus(sizes, kind, randn):
+    counts = np.array(sizes)
+    starts = np.maximum(counts - 1, 0)
+    numbers = np.ceil(0.3 * counts).astype(np.int64)
+    x = randn(int(counts.sum()), 3)
+    if kind == "whole numbers":
+        x = (1000 * x).long()
+    elif kind == "without channels":
+        x = x[:, 0]
+
+    rows = _on_device(x, counts, numbers, starts)
+
+    expected = []
+    begin = 0
+    for count, number in zip(sizes, numbers.tolist(), strict=True):
+        if count > 0:
+            cloud = x[begin : begin + count].double().view(1, count, -1)
+            (of_cloud,) = farthest_point_sample(cloud, number, start=count - 1)
+            expected.append(of_cloud + begin)
+        begin += count
+    assert torch.equal(rows, torch.cat(expected))
+
+
+def test_flat_fps_in_the_form_for_gpus_refuses_points_that_are_not_finite():
+    one = np.array([1])
+
+    with pytest.raises(UserError, match="x must be finite, got NaN or infinity"):
+        _on_device(torch.full((1, 3), torch.nan), one, one, one - 1)
 
 
 def test_ratio_of_each_cloud_is_its_own(rand):

@@ -83,12 +83,19 @@ def plain_column(net, cloud, keys, j, row, unit):
 
 
 @pytest.mark.parametrize("training", [True, False])
-@pytest.mark.parametrize("number", [20, 90])
-def test_anchors_equal_dense_softmax_of_distances(training, number, randn):
-    net = small(moved=True, tau_min=0.3)
+@pytest.mark.parametrize(
+    ("number", "m"),
+    [
+        (20, 6),
+        (90, 6),
+        (90, 70),  # more than the farthest points whose spacing is the unit
+    ],
+)
+def test_anchors_equal_dense_softmax_of_distances(training, number, m, randn):
+    net = small(m=m, moved=True, tau_min=0.3)
     net.double().train(training)
     points = randn(3, number, 3, dtype=torch.float64, requires_grad=True)
-    direction = randn(3, 6, 3, dtype=torch.float64)
+    direction = randn(3, m, 3, dtype=torch.float64)
 
     output = net(points)
 

@@ -13,13 +13,10 @@ from mops_lightning import (
     FPSSampler,
     GumbelSampler,
     MOPSNet,
-    PoissonSampler,
     ProgressiveSampleNet,
     SampleNet,
     Sampler,
-    SerialSampler,
     SNet,
-    VoxelSampler,
 )
 from mops_lightning.config.compose import compose
 from mops_lightning.config.groups import conf_dir
@@ -48,7 +45,7 @@ LIMITS: list[tuple[type[Sampler], dict[str, Any]]] = [
 START = "start must be at least 0, farthest, or null.* got"
 STARTS: tuple[Any, ...] = (-1, "nearest", "", True, 1.0, [0], np.array([1, 2]))
 WIDTH = "anchor_width must be above 0 and at most 100, got"
-WIDTHS = (0.0, -1.0, nan, 1e30)
+WIDTHS = (0.0, -1.0, nan, 100.5, 1e30)
 INVALID: list[tuple[type[Sampler], dict[str, Any], str]] = [
     *((FPSSampler, {"start": start}, START) for start in STARTS),
     (MOPSNet, {"tau_min": 0.0}, "tau_min must be above 0 and at most 1, got 0.0"),
@@ -84,8 +81,28 @@ INVALID: list[tuple[type[Sampler], dict[str, Any], str]] = [
     (ProgressiveSampleNet, {"size_reduction": "summ"}, "size_reduction: unknown 'summ'.*sum"),
 ]
 """Arguments outside of these limits, and the errors."""
-NOT_FLEXIBLE = (GumbelSampler, MOPSNet, SNet, SampleNet)
-FLEXIBLE_NOT_NESTED = (VoxelSampler, PoissonSampler, SerialSampler)
+WORDS = ("any_unit", "flexible", "generates", "nested", "projects", "spreads")
+DECLARED = """
+CovarianceSampler: flexible nested
+CriticalSampler: flexible nested spreads
+FMOPSNet: flexible generates nested spreads
+FPSSampler: any_unit flexible nested spreads
+GumbelSampler: generates spreads
+InformationSampler: flexible nested
+MOPSNet: generates spreads
+NormalSpaceSampler: flexible nested
+PoissonSampler: any_unit flexible spreads
+PoseSampler: flexible nested
+ProgressiveSampleNet: flexible generates nested projects spreads
+RandomSampler: any_unit flexible nested
+SNet: generates spreads
+SampleNet: generates projects spreads
+SerialSampler: any_unit flexible
+StageMOPSNet: flexible generates nested spreads
+SteadySampler: flexible nested
+VoxelSampler: flexible spreads
+"""
+"""What ``Sampler`` says of each; of samplers that do not spread points, tiles are not thinned."""
 
 
 def accepting_classes(cls):
@@ -116,9 +133,10 @@ def test_constructor_has_the_defaults_of_its_file(name):
 
 
 @pytest.mark.parametrize("sampler", package_samplers())
-def test_sampler_declares_sizes(sampler):
-    assert sampler.flexible == (sampler not in NOT_FLEXIBLE)
-    assert sampler.nested == (sampler not in (*NOT_FLEXIBLE, *FLEXIBLE_NOT_NESTED))
+def test_sampler_declares_what_it_does(sampler):
+    declared = {name for name in WORDS if getattr(sampler, name)}
+
+    assert f"{sampler.__name__}: {' '.join(sorted(declared))}" in DECLARED.splitlines()
 
 
 @pytest.mark.parametrize(("sampler", "arguments"), LIMITS)

@@ -95,6 +95,7 @@ def plain_dense(net, points, m):
         (3, None),
         (None, 7),
         (40, 9),
+        (12, 5),  # more than the farthest points whose spacing is the unit
         (1, 1),
     ],
 )

@@ -14,11 +14,13 @@ from mops_lightning.nets.autoencoder import AutoEncoder
 from mops_lightning.nets.foldingnet import MFoldingNet
 from mops_lightning.nets.hierarchical import HierarchicalSegmentation
 from mops_lightning.nets.pcrnet import PCRNet
+from mops_lightning.nets.plane_icp import PlaneICP
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.tasks.classification import Classification
 from mops_lightning.tasks.reconstruction import Reconstruction
 from mops_lightning.tasks.registration import Registration
+from mops_lightning.tasks.scan_registration import ScanRegistration
 from mops_lightning.tasks.segmentation import Segmentation
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.types import Batch
@@ -43,6 +45,54 @@ TASKS = {
 }
 # Sizes on both sides of 32 points, where the pooling layer changes its algorithm, in one step.
 LEARNED = ("mops", "fmops", "snet", "samplenet", "samplenet-progressive")
+
+
+MEASURED = {
+    "classification": ["accuracy", "mean_class_accuracy"],
+    "reconstruction": [
+        "chamfer",
+        "emd",
+        "nre_cd",
+        "nre_cd_of_means",
+        "nre_emd",
+        "nre_emd_of_means",
+    ],
+    "registration": [
+        "rotation_error_deg",
+        "rotation_error_doubled_deg",
+        "rotation_error_p90_deg",
+        "rotation_recall_10deg",
+        "rotation_recall_5deg",
+        "translation_error",
+    ],
+    "segmentation": ["mean_iou", "point_accuracy"],
+    "icp": [
+        "median_rotation_error_deg",
+        "rotation_error_deg",
+        "rotation_recall_2deg",
+        "translation_error",
+    ],
+}
+"""The names of the metrics of each task."""
+
+SCORES = {
+    "classification": ("accuracy", None),
+    "reconstruction": ("nre_cd", "chamfer"),
+    "registration": ("rotation_error_deg", None),
+    "segmentation": ("mean_iou", None),
+    "icp": ("median_rotation_error_deg", None),
+}
+"""Of each task, the score of samples, and that of full clouds where it is another one."""
+
+
+@pytest.mark.parametrize("name", MEASURED)
+def test_task_measures_these_metrics_and_has_this_score(name):
+    make: Any = TASKS.get(name, lambda: ScanRegistration(PlaneICP()))
+
+    task = make()
+
+    assert sorted(task.metrics()) == MEASURED[name]
+    assert (task.score, task.full_score) == SCORES[name]
 
 
 def trained_parts(task: str, sampler: str | None, learn: Any) -> set[str]:
