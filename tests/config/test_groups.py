@@ -120,7 +120,7 @@ experiment=classification_snet sampler=samplenet: sampler.k=7 sampler.beta=1.0 s
 experiment=classification_snet sampler=samplenet: sampler.sigma_min=0.0 sampler.coverage=1.0
 experiment=classification_snet sampler=samplenet: sampler.coverage_per_point=0.0 optimizer.lr=0.01
 experiment=classification_snet sampler=samplenet: optimizer.schedule.every=18750
-experiment=classification_snet sampler=samplenet: optimizer.schedule.floor_lr=1e-05 pretrain.lr=0.001
+experiment=classification_snet sampler=samplenet: optimizer.schedule.floor_lr=1e-05
 experiment=classification_snet sampler=samplenet: trainer.max_epochs=500 val_fraction=0.0
 """
 """Settings, and the values that others have then."""

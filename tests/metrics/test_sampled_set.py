@@ -115,6 +115,16 @@ def test_nonzero_percent_leaves_out_entries_below_a_hundredth(clouds):
     assert percent.tolist() == pytest.approx([one_of_40, one_of_40, one_of_40])
 
 
+def test_nonzero_percent_counts_entries_above_a_hundredth(clouds):
+    columns = torch.zeros(5, 40)
+    columns[:, 7] = math.log(0.532 / 0.012)  # an entry of 0.532, and 39 of 0.012
+    output = output_of_matrix(clouds, columns, 1.0)
+
+    percent = values("matrix/nonzero_percent", clouds, output)
+
+    assert percent.tolist() == pytest.approx([100, 100, 100])
+
+
 def test_nonzero_percent_counts_each_column(clouds):
     # Column j of S has j + 1 equal entries.
     columns = 50 * torch.ones(5, 40).tril()

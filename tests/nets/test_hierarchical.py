@@ -18,6 +18,7 @@ from mops_lightning.nets.hierarchical import (
     carried,
 )
 from mops_lightning.ops.points import gather_points
+from mops_lightning.ops.propagation import interpolate
 from mops_lightning.tasks.classification import Classification
 from mops_lightning.tasks.segmentation import Segmentation
 from mops_lightning.types import Batch
@@ -194,3 +195,31 @@ def test_losses_of_stages_are_part_of_the_step(make_net, make_task, kind, randn)
     assert sorted(losses) == ["cross_entropy", "stage1_subset", "stage2_subset"]
     assert losses["stage1_subset"] > 0
     assert sorted(losses_in_test) == ["cross_entropy"]
+
+
+def test_segmentation_goes_back_through_the_levels_with_the_whole_cloud_at_the_deepest(randn):
+    net: Any = HierarchicalSegmentation(5, mops.FPSSampler, (20, 8), (8, 16, 24), 4).eval()
+    points = randn(2, 40, 3)
+
+    logits = net(points)
+
+    (_, of_input), (of_20, features_of_20), (of_8, features_of_8) = net.levels(points)
+    whole_cloud = features_of_8.amax(1, keepdim=True).expand(2, 8, 24)
+    deepest = torch.cat([features_of_8, whole_cloud], 2)
+    to_20, to_input = net.back
+    carried_to_20 = interpolate(deepest, of_8, of_20, k=3)
+    back_at_20 = to_20(torch.cat([carried_to_20, features_of_20], 2))
+    carried_to_input = interpolate(back_at_20, of_20, points, k=3)
+    back_at_input = to_input(torch.cat([carried_to_input, of_input], 2))
+    assert_close(logits, net.head(back_at_input))
+
+
+def test_classifier_sees_the_peaks_of_all_stages_and_the_mean_of_the_last(randn):
+    net: Any = HierarchicalNet(5, mops.FPSSampler, (20, 8), (8, 16, 24), 4).eval()
+    points = randn(2, 40, 3)
+
+    logits = net(points)
+
+    _, (_, features_of_20), (_, features_of_8) = net.levels(points)
+    seen = [features_of_20.amax(1), features_of_8.amax(1), features_of_8.mean(1)]
+    assert_close(logits, net.head(torch.cat(seen, 1)))

@@ -236,3 +236,17 @@ def test_compiled_forms_take_finite_points_only(k, rand):
     assert compiled.farthest(finite, indices, counts, 4) is not None
     assert compiled.nearest(with_nan[:, :5], with_nan, k) is None
     assert compiled.farthest(with_nan, indices, counts, 4) is None
+
+
+def test_neighbours_in_threads_take_finite_points_only(rand, monkeypatch):
+    monkeypatch.setattr(compiled, "THREADS_MIN_WORK", 1)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    points = rand(2, 30, 3)
+    queries = points[:, :5]
+    expected = compiled.nearest(queries, points.clone(), 3)
+    with_nan = points.clone()
+    with_nan[1, 7, 0] = torch.nan
+
+    assert expected is not None
+    assert torch.equal(expected, k_nearest(queries, points, 3)[1])
+    assert compiled.nearest(queries, with_nan, 3) is None

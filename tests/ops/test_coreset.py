@@ -228,6 +228,8 @@ UNKNOWN_SHIFT = pose_of([0, 0, 0], [0, np.nan, 0])
         ("pose", {}, r"pose must be numbers \(4, 4\), got dict"),
         ("pose", UNKNOWN_SHIFT, "pose must be finite, got NaN"),
         ("pose", 2 * np.eye(4), r"pose must be a \(4, 4\) rigid motion"),
+        ("pose", np.diag([1.0, 1.0, -1.0, 1.0]), "a rotation and a shift, with .* below"),
+        ("pose", np.diag([1.0, 1.0, 1.0, 2.0]), "a rotation and a shift, with .* below"),
         ("normals", np.ones((4, 3)), r"normals must be one per target point, \(50, 3\)"),
         ("max_distance", 0.0, "max_distance must be a number above 0, got 0.0"),
         ("max_distance", None, "max_distance must be a number above 0, got None"),
@@ -267,3 +269,15 @@ def test_coreset_of_sums_too_large_for_float64_is_refused(size):
 
     with pytest.raises(UserError, match="too large for float64"):
         coreset(source, target, pose, 29, normals=normals)
+
+
+def test_coreset_has_residuals_of_points_as_far_as_the_largest_distance():
+    target = np.zeros((1, 3))
+    source = np.zeros((3, 3))
+    source[:, 2] = [1.0, 2.0, 2.25]
+    normal = np.array([[0.0, 0.0, 1.0]])
+
+    rows, weights = coreset(source, target, np.eye(4), 29, normals=normal, max_distance=2.0)
+
+    assert rows.tolist() == [0, 1]
+    assert weights.tolist() == [1.0, 1.0]

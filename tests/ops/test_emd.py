@@ -127,6 +127,7 @@ def test_emd_keeps_dtype(rng):
     ("change", "message"),
     [
         ({"others": torch.zeros(2, 6, 3)}, r"same N, got \(2, 5, 3\) and \(2, 6, 3\)"),
+        ({"points": torch.zeros(5, 3), "others": torch.zeros(5, 3)}, r"both be \(B, N, 3\)"),
         ({"block": 1}, "block must be at least 2, got 1"),
         ({"rounds": -1}, "rounds must be at least 0, got -1"),
         ({"workers": 0}, "workers must be at least 1, got 0"),

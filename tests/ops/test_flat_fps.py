@@ -52,7 +52,9 @@ def test_flat_fps_equals_torch_cluster(sizes, ratio, shape, randn):
     x = randn(len(batch), *shape)
 
     rows = fps(x, batch, ratio, random_start=False, batch_size=number + 1)
+    rows_of_all = fps(x, batch, ratio, random_start=False, batch_size=number)
 
+    assert torch.equal(rows_of_all, rows)
     assert torch.equal(rows, torch_cluster_fps(x, batch, ratio))
     if number == 1:
         without_batch = fps(x, ratio=ratio, random_start=False)
@@ -232,6 +234,39 @@ def test_fps_number_of_points_is_that_of_pyg_lib(dtype):
     rows = fps(x, ratio=0.1, random_start=False)
 
     assert len(rows) == 200  # in half precision 0.1 is below 0.1, and 0.3 above 0.3
+
+
+def test_fps_number_of_points_is_rounded_in_single_precision():
+    x = torch.arange(70.0)
+
+    rows = fps(x, ratio=0.1, random_start=False)
+
+    assert len(rows) == 7  # in double precision, 0.1 · 70 is above 7
+
+
+def test_fps_of_large_whole_numbers_is_exact():
+    x = np.array([[0], [2**24], [2**24 + 1]])  # the last two are equal in single precision
+
+    rows = fps(x, ratio=0.5, random_start=False)
+
+    assert rows.tolist() == [0, 2]
+
+
+def test_fps_of_bfloat16_is_that_of_its_numbers(randn):
+    x = randn(50, 3).bfloat16()
+
+    rows = fps(x, ratio=0.4, random_start=False)
+
+    assert torch.equal(rows, fps(x.double(), ratio=0.4, random_start=False))
+
+
+def test_fps_takes_truth_values_for_two_clouds(rand):
+    x = rand(20, 3)
+    is_second = torch.arange(20) >= 8
+
+    rows = fps(x, is_second, 0.5, random_start=False)
+
+    assert torch.equal(rows, fps(x, is_second.long(), 0.5, random_start=False))
 
 
 def test_fps_of_an_array_does_not_import_torch():

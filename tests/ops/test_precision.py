@@ -8,7 +8,11 @@ from torch.testing import assert_close
 from mops_lightning.nets.foldingnet import MFoldingNet
 from mops_lightning.nets.max_pool import PLAIN_MAX_POINTS, PointMaxPool
 from mops_lightning.nets.pcrnet import PCRNet
-from mops_lightning.ops.precision import full_precision
+from mops_lightning.ops.precision import (
+    full_precision,
+    pointwise_autocast_dtype,
+    restrict_autocast_to_pointwise,
+)
 from mops_lightning.ops.rigid import Motion
 from mops_lightning.samplers.mops import MOPSNet
 from tests.support.mixed import mixed
@@ -118,3 +122,15 @@ def test_nets_under_plain_autocast_are_close(make, randn):
 
     assert_close(output, expected, rtol=0.05, atol=0.05)
     assert F.cosine_similarity(gradients, expected_gradients, dim=0) > 0.9
+
+
+def test_pointwise_layers_keep_the_dtype_of_the_training_as_long_as_the_step_lasts():
+    dtypes = []
+    with torch.autocast("cpu", torch.bfloat16), restrict_autocast_to_pointwise("cpu"):
+        dtypes.append(pointwise_autocast_dtype())
+        with restrict_autocast_to_pointwise("cpu"):
+            dtypes.append(pointwise_autocast_dtype())
+        dtypes.append(pointwise_autocast_dtype())
+    dtypes.append(pointwise_autocast_dtype())
+
+    assert dtypes == [torch.bfloat16, torch.bfloat16, torch.bfloat16, None]

@@ -177,6 +177,7 @@ M = np.array(3)
         ({"rows": COLUMN, "m": np.array(4)}, r"each of 4 sampled points, shape \(4,\), got"),
         ({"rows": ROWS, "m": M}, "weights must be finite"),
         ({"rows": ROWS, "m": M, "weights": ROWS * np.nan}, "weights must be finite"),
+        ({"rows": ROWS, "m": M, "weights": -ROWS - 1.0}, "weights must be finite, at least 0"),
     ],
     ids=[
         "no rows",
@@ -192,6 +193,7 @@ M = np.array(3)
         "other m than labels",
         "no weights",
         "weights not finite",
+        "weights below 0",
     ],
 )
 def test_bad_map_gets_one_line(arrays, said, tmp_path):
@@ -236,6 +238,7 @@ POINTS = torch.rand(6, 3)
         ({"points": POINTS * torch.nan}, "must be finite"),
         ({"points": "scan.ply"}, "points must be a tensor or an array, got str"),
         ({"batch": [0] * 6}, "batch and sampled_batch belong together"),
+        ({"sampled_batch": [0] * 4}, "batch and sampled_batch belong together"),
         ({"batch": [0, 1] * 3, "sampled_batch": [0] * 4}, "batch must be ascending"),
         (
             {"batch": [0] * 5, "sampled_batch": [0] * 4},
@@ -351,3 +354,13 @@ def test_map_file_with_arrays_that_are_no_numbers_is_refused(kind, name, tmp_pat
 
     with pytest.raises(UserError, match=r"is no map|weights must be finite"):
         propagate(np.array([7, 8]), path)
+
+
+def test_map_file_with_whole_numbers_as_weights_is_read(tmp_path):
+    path = tmp_path / "map.npz"
+    rows = np.array([[0, 1], [1, 2]])
+    np.savez(path, rows=rows, m=np.array(3), weights=np.array([[1, 0], [0, 1]]))
+
+    carried = propagate(np.array([0.5, 1.5, 2.5]), path)
+
+    assert carried.tolist() == [0.5, 2.5]

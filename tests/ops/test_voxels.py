@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mops_lightning.errors import UserError
+from mops_lightning.ops import voxels
 from mops_lightning.ops.voxels import occupied, representatives
 
 RNG = np.random.default_rng(0)
@@ -156,3 +157,14 @@ def test_too_small_voxels_are_refused():
 
     with pytest.raises(UserError, match="voxel: 1e-12 is too small for coordinates of up to 5e"):
         occupied(points, 1e-12)
+
+
+def test_more_points_in_a_voxel_than_their_sums_hold_are_refused(monkeypatch):
+    monkeypatch.setattr(voxels, "MOST", 3)
+    three = np.full((3, 3), 0.5)
+    part = voxels.occupied(three, 1.0)
+
+    with pytest.raises(UserError, match=r"voxel: 4 points share one\. Use voxels of up to 3 poi"):
+        voxels.occupied(np.full((4, 3), 0.5), 1.0)
+    with pytest.raises(UserError, match="voxel: 6 points share one"):
+        part.merge(part)

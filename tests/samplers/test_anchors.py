@@ -220,8 +220,9 @@ def test_anchors_warm_start_keeps_their_start():
     assert torch.equal(net.queries.slots, first_slots)
 
 
-def test_anchors_refuse_chunks(randn):
-    net = small().eval()
+@pytest.mark.parametrize("anchors", ["fps", "framed"])
+def test_anchors_refuse_chunks(anchors, randn):
+    net = small(anchors=anchors).eval()
     points = randn(50, 3)
     chunks = points.split(20)
 

@@ -52,11 +52,12 @@ def test_input_of_wrong_type_raises(make, clouds):
     if make().learned:
         with pytest.raises(UserError, match=r"must be torch\.float32 like the sampler's weights"):
             make()(clouds.half())
-    for m in (8.0, 0):
+    for m in (8.0, 0, True):
         with pytest.raises(UserError, match=f"m must be a whole number of at least 1, got {m}"):
             make(m=m)
-    with pytest.raises(UserError, match="whole number, got 8"):
-        make()(clouds, 8.0)
+    for m in (8.0, True):
+        with pytest.raises(UserError, match=f"whole number, got {m}"):
+            make()(clouds, m)
 
 
 @pytest.mark.parametrize("training", [True, False])

@@ -326,3 +326,14 @@ def test_local_settings_out_of_range_raise(settings, words):
     arguments = {"anchors": "fps", "candidates": 4, "neighbours": 5}
     with pytest.raises(UserError, match=words):
         MOPSNet(6, **(arguments | settings))
+
+
+@pytest.mark.parametrize(
+    ("columns", "is_thinned"),
+    [
+        ({"candidates": 2, "neighbours": None}, True),
+        ({"candidates": None, "neighbours": 3}, False),
+    ],
+)
+def test_local_columns_of_few_candidates_are_declared(columns, is_thinned):
+    assert local(**columns).is_thinned == is_thinned

@@ -192,6 +192,19 @@ def test_smoothed_labels_give_every_class_a_share(randn):
     assert_close(loss, expected)
 
 
-def test_label_smoothing_of_one_is_refused():
-    with pytest.raises(UserError, match=r"label_smoothing must be in \[0, 1\), got 1"):
-        Classification(PointNetVanilla(4), 4, label_smoothing=1.0)
+@pytest.mark.parametrize("share", [1.0, -0.1])
+def test_label_smoothing_out_of_range_is_refused(share):
+    with pytest.raises(UserError, match=rf"label_smoothing must be in \[0, 1\), got {share}"):
+        Classification(PointNetVanilla(4), 4, label_smoothing=share)
+
+
+def test_net_of_another_task_is_refused():
+    net = PointNetVanilla(4)
+
+    with pytest.raises(UserError) as refused:
+        Registration(net)
+
+    assert str(refused.value) == (
+        "net must take (source, target), as registration needs it; got PointNetVanilla, which "
+        "takes (points). Choose a net of this task."
+    )

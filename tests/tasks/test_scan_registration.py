@@ -255,6 +255,8 @@ def test_clouds_of_one_point_and_wrong_limits_raise(clouds):
         batch_of(single_points)
     with pytest.raises(UserError, match="angle must be at least 0"):
         task(angle=-1)
+    with pytest.raises(UserError, match="shift must be at least 0"):
+        task(shift=-0.1)
     with pytest.raises(UserError, match="max_distance must be a number above 0"):
         task(max_distance=0.0)
 

@@ -19,6 +19,7 @@ from mops_lightning.errors import UserError
 from mops_lightning.nets.hierarchical import HierarchicalSegmentation
 from mops_lightning.ops.propagation import interpolate
 from mops_lightning.samplers.fps import FPSSampler
+from mops_lightning.tasks.base import figures_of
 from mops_lightning.tasks.segmentation import Segmentation
 from mops_lightning.types import UNKNOWN, Batch
 
@@ -393,3 +394,20 @@ def test_scans_with_broken_numbers_as_labels_are_refused(scans):
 
     with pytest.raises(UserError, match=r"'kind' must hold whole int64 numbers, got 0\.5\."):
         cloud_folder(scans)
+
+
+def test_figure_shows_true_parts_and_those_predicted_from_every_readout(halves):
+    task = Segmentation(Halves(), 2)
+    sample = halves.points[:, :3]
+
+    figures = figures_of(task, halves, {"fps": sample}, ["a", "b", "c"])
+
+    true, predicted = figures["parts"].axes[2:4]  # of the second cloud
+    (drawn_true,) = true.collections
+    (drawn_predicted,) = predicted.collections
+    result = task.step(halves, sample)
+    titles = [axes.get_title() for axes in figures["parts"].axes[:2]]
+    assert titles == ["true parts", "fps"]
+    assert np.asarray(drawn_true.get_array()).tolist() == halves.parts[1].tolist()
+    assert np.asarray(drawn_predicted.get_array()).tolist() == result.predictions[1].tolist()
+    assert not torch.equal(result.predictions[1], halves.parts[1])

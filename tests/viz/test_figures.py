@@ -103,7 +103,10 @@ def test_matrix_figure_shows_ideal_matrix_as_diagonal_and_every_large_entry(numb
         assert (steps > 0).all()
     bottom = number - 0.5
     assert list(matrix.get_extent()) == [-0.5, 3.5, bottom, -0.5]
+    assert matrix.get_clim() == (0, 1)
+    assert figure.get_suptitle() == "chair"
     (gram_image,) = axes_of_gram.images
+    assert gram_image.get_clim() == (0, 1)
     drawn_gram = np.asarray(gram_image.get_array())
     np.testing.assert_array_equal(drawn_gram, np.eye(4))
 
@@ -297,6 +300,16 @@ def test_view_upright_draws_the_upper_end_above_and_no_mirror_image(up):
     assert np.linalg.det(ground) > 0
 
 
+def test_clouds_are_seen_with_y_up_unless_another_axis_is_asked_for(rand):
+    figure = figures.cloud_grid(rand(1, 9, 3), {}, [""])
+    axes: Any = figure.axes[0]
+    by_default = axes.get_proj()
+
+    figures.view_upright(figure, "y")
+
+    np.testing.assert_array_equal(axes.get_proj(), by_default)
+
+
 @pytest.mark.parametrize("up", ["x", "y", "z"])
 def test_to_y_up_is_a_rotation_that_raises_the_vertical_axis(up):
     axes = torch.eye(3)
@@ -359,3 +372,26 @@ def test_cloud_grid_draws_points_in_the_colours_of_a_channel(tmp_path, rand):
         assert len(bright_rows) > 50
         assert len(dark_rows) > 50
         assert bright_rows.mean() < dark_rows.mean()
+
+
+@pytest.mark.parametrize("suffix", ["png", "svg"])
+def test_saved_figure_says_what_wrote_it_and_no_date(suffix, tmp_path):
+    figure = figures.new_figure(1, 1)
+
+    saved = figures.save_figure(figure, tmp_path / f"a.{suffix}", software="a program 1.2")
+
+    content = saved.read_bytes()
+    assert b"a program 1.2" in content
+    assert b"<dc:date>" not in content
+    if suffix == "png":
+        with Image.open(saved) as image:
+            assert image.info["Software"] == "a program 1.2"
+
+
+def test_images_in_a_vector_graphic_have_the_resolution_that_is_asked_for(tmp_path, rand):
+    figure = figures.cloud_grid(rand(1, 50, 3), {}, [""])
+
+    coarse = figures.save_figure(figure, tmp_path / "coarse.svg", dpi=50)
+    fine = figures.save_figure(figure, tmp_path / "fine.svg", dpi=200)
+
+    assert fine.stat().st_size > 1.5 * coarse.stat().st_size

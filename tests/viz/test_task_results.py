@@ -226,6 +226,8 @@ def test_clouds_are_drawn_with_one_scale_on_all_axes():
     assert axes.get_xlim() == pytest.approx((0, 8))
     assert axes.get_ylim() == pytest.approx((-5, 3))
     assert axes.get_zlim() == pytest.approx((-3.5, 4.5))
+    width, depth, height = axes._box_aspect
+    assert width == depth == height
 
 
 @pytest.mark.parametrize(
@@ -263,3 +265,25 @@ def test_colours_leave_out_the_most_extreme_hundredth_at_both_ends():
     assert (at_low_limit != above_low_limit).any()
     np.testing.assert_array_equal(at_high_limit, highest)
     assert (below_high_limit != at_high_limit).any()
+
+
+def test_points_of_unknown_part_are_grey():
+    points = torch.rand(1, 3, 3)
+    parts = torch.tensor([[0, -1, 5]])
+
+    figure = part_grid(points, {"true": parts}, ["a"])
+
+    (drawn,) = figure.axes[0].collections
+    _, unknown, _ = drawn.to_rgba(drawn_values(drawn))
+    light_grey = (211 / 255, 211 / 255, 211 / 255, 1.0)
+    assert tuple(unknown) == pytest.approx(light_grey)
+
+
+def test_samples_are_framed_as_their_cloud(randn):
+    points = randn(1, 30, 3)
+    near_the_middle = 0.1 * points[:, :5]
+
+    figure = figures.cloud_grid(points, {"matched": near_the_middle}, [""])
+
+    whole, sampled = figure.axes
+    assert sampled.get_xlim() == whole.get_xlim()

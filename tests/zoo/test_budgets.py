@@ -45,6 +45,21 @@ def test_m_of_another_kind_is_refused(m):
         downsample(CLOUD, m)
 
 
+@pytest.mark.parametrize("m", [1.0, np.float32(1), torch.tensor(1.0)])
+def test_share_of_one_is_refused_with_what_it_could_mean(m):
+    with pytest.raises(UserError, match=r"One point is m=1, all points need no sampling\."):
+        downsample(CLOUD, m)
+
+
+@pytest.mark.parametrize("name", ["spacing", "voxel"])
+@pytest.mark.parametrize("size", [True, 0.0, -1.0, float("inf"), float("nan"), "1"])
+def test_distance_that_is_no_number_above_0_is_refused(name, size):
+    budget: dict[str, Any] = {name: size}
+
+    with pytest.raises(UserError, match=f"^{name} must be a number above 0, .* got {size}"):
+        downsample(CLOUD, **budget)
+
+
 @pytest.mark.parametrize("arguments", [{}, {"m": 5, "spacing": 1.0}, {"spacing": 1, "voxel": 1}])
 def test_not_one_budget_is_refused(arguments):
     with pytest.raises(UserError, match="give m, spacing or voxel, got"):

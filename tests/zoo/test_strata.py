@@ -50,6 +50,8 @@ def test_stratify_min_keeps_rare_points():
         ([100, 60, 4, 4], 20, 4, {0: 7, 1: 5, 2: 4, 3: 4}),
         # One each, and of the other six 3.43, 1.71 and 0.85.
         ([50, 30, 20, 1], 10, 1, {0: 4, 1: 3, 2: 2, 3: 1}),
+        # All points are those that every class keeps.
+        ([30, 10], 4, 2, {0: 2, 1: 2}),
         # As many as the classes have.
         ([5, 3, 1], 9, 2, {0: 5, 1: 3, 2: 1}),
     ],

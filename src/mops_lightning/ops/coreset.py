@@ -191,7 +191,8 @@ def _motion(pose: Any) -> Array:
         raise UserError("pose must be finite, got NaN or infinity.")
     rotation = motion[:3, :3]
     is_orthogonal = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
-    if not is_orthogonal or not np.allclose(motion[3], [0, 0, 0, 1]):
+    is_rotation = is_orthogonal and np.linalg.det(rotation) > 0
+    if not is_rotation or not np.allclose(motion[3], [0, 0, 0, 1]):
         raise UserError(
             "pose must be a (4, 4) rigid motion: a rotation and a shift, with (0, 0, 0, 1) below; "
             f"got {motion.tolist()}."
