@@ -1,6 +1,7 @@
 import pytest
 
 from mops_lightning.report import paper
+from mops_lightning.report.build import build_report
 from tests.support.records import NAMES, evaluated
 from tests.support.reports import put, put_cell, put_pairs, rows, table
 
@@ -141,3 +142,30 @@ def test_published_tables_are_complete(name):
         assert set(sizes) == SIZES[name]
         count = 1 if sampler in ("random", "voxel", "fps") or "large" in name else 3
         assert {len(values) for values in sizes.values()} == {count}
+
+
+def test_remarks_name_all_hidden_and_collapsed_runs_and_count_groups_not_tables(tmp_path):
+    collapsed = {"test/generated/accuracy": 0.5, "test/matched/unique_points": 3.0}
+    for hour in (1, 2, 3):
+        started = f"2026-01-01T0{hour}:00:00+00:00"
+        put(tmp_path / f"{hour}", "mops", 32, collapsed, started=started, threads=2)
+    for data in ("first", "second"):
+        scores = {"test/sampled/accuracy": 0.3, "test/sampled/unique_points": 32.0}
+        put(tmp_path / data, "fps", 32, scores, dataset_fingerprint=data, threads=2)
+
+    report = build_report(tmp_path, ("accuracy", "unique_points"))
+
+    assert len(report.grids) == 6
+    hidden = "not shown; a later run has the same row, column and seed"
+    made = "nothing to train, seed 0, cpu, 2 threads, commit 0123456789"
+    assert report.remarks == [
+        f"- mops: {made}",
+        f"- fps: {made}",
+        "- mops: collapsed: only 3.0 of 32 matched points are distinct. Use the completed set, "
+        "whose points are distinct.",
+        f"- {tmp_path}/1/mops-32-pointnet: {hidden}",
+        f"- {tmp_path}/2/mops-32-pointnet: {hidden}",
+        "",
+        "3 groups of runs are not comparable and have tables of their own. --mixed joins groups "
+        "that differ in commit or settings only.",
+    ]

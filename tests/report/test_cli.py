@@ -2,12 +2,14 @@ import csv
 
 import pytest
 
+from mops_lightning.filesystem import TEMPORARY
 from mops_lightning.metrics.base import collection
 from mops_lightning.metrics.classification import Accuracy
 from mops_lightning.records import run_record
 from mops_lightning.report.cli import main
 from mops_lightning.tasks.classification import Classification
 from tests.support.command_line import TINY, done, runs
+from tests.support.records import evaluated
 from tests.support.reports import put, put_planes, rows
 
 
@@ -178,3 +180,58 @@ def test_edited_record_is_named(tmp_path, capsys):
     main([str(tmp_path)])
 
     assert f"- {path.parent}: the record was edited after the run" in capsys.readouterr().out
+
+
+def test_csv_has_every_figure_of_every_run(tmp_path):
+    learned = {
+        "test/m8/generated/accuracy": 0.5,
+        "test/m8/fps/accuracy": 0.25,
+        "test/m8/generated/ratio": None,
+        "test/full/accuracy": 0.9,
+        "test/loss/cross_entropy": 1.0,
+    }
+    seconds = {"fit": 10.0, "total": 12.0}
+    put(tmp_path / "a", "fmops", 32, learned, seed=3, seconds=seconds, device="NVIDIA H100")
+    joint = {"evaluated": evaluated(seed=5, learn="joint"), "task_weights_sha256": "v"}
+    put(tmp_path / "b", "mops", 8, {"test/generated/accuracy": 0.125}, **joint)
+    put(tmp_path / "c", "fps", 16, {"test/sampled/accuracy": 0.1}, net="icp", threads=1)
+
+    main([str(tmp_path)])
+
+    commit = "0123456789" * 4
+    first = f"{tmp_path}/a/fmops-32-pointnet,fmops,sampler alone,3,3"
+    of_first = f"pointnet w,{commit},NVIDIA H100"
+    assert (tmp_path / "table.csv").read_text().splitlines() == [
+        "folder,sampler,learn,seed,epochs,m,readout,metric,value,net,commit,device",
+        f"{first},8,generated,accuracy,0.5,{of_first}",
+        f"{first},8,fps,accuracy,0.25,{of_first}",
+        f"{first},32,full,accuracy,0.9,{of_first}",
+        f"{tmp_path}/b/mops-8-pointnet,mops,joint,5,9,8,generated,accuracy,0.125,"
+        f"pointnet v,{commit},cpu",
+        f"{tmp_path}/c/fps-16-icp,icp on fps,sampler alone,0,0,16,sampled,accuracy,0.1,"
+        f"icp,{commit},cpu",
+    ]
+
+
+def test_report_joins_groups_and_shows_other_metrics_on_request(tmp_path, capsys):
+    for name, commit in (("a", "a" * 40), ("b", "b" * 40)):
+        scores = {"test/sampled/accuracy": 0.3, "test/sampled/ratio": 2.0}
+        put(tmp_path / name, name, 32, scores, git={"commit": commit, "dirty": False})
+
+    main([str(tmp_path), "--mixed", "--metric", "ratio"])
+
+    text = capsys.readouterr().out
+    assert rows(text) == [["sampled by", "m=32"], ["a", "2"], ["b", "2"]]
+
+
+def test_report_removes_what_a_killed_report_left(tmp_path, capsys):
+    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.3})
+    left = tmp_path / f"{TEMPORARY}table-x.md"
+    left.write_text("half")
+    of_a_run = tmp_path / "fps-32-pointnet" / f"{TEMPORARY}last-x.ckpt"
+    of_a_run.write_text("half")
+
+    main([str(tmp_path)])
+
+    assert not left.exists()
+    assert of_a_run.exists()  # its run may be writing it

@@ -75,3 +75,37 @@ def test_collect_named_pipe_is_skipped(tmp_path):
     for name in ("result.json", "runs.jsonl", ".failed"):
         os.mkfifo(tmp_path / "pipe" / name)
     assert "result.json: no run record" in table(tmp_path)
+
+
+def test_collect_says_why_runs_have_no_result_and_lists_three(tmp_path):
+    part = ["trained for 1 of 2 steps", "tested on 1 of 4 batches"]
+    changes = {
+        "a": {"status": "failed", "error": "UserError: m is wrong", "partial": part},
+        "b": {"status": "interrupted", "error": "Stopped."},
+        "c": {"status": "running"},
+        "d": {"status": "running"},
+    }
+    for name, of_run in changes.items():
+        put(tmp_path / name, "fps", 32, {"test/sampled/accuracy": 0.3}, **of_run)
+    reasons = {
+        "a": "failed: trained for 1 of 2 steps and tested on 1 of 4 batches",
+        "b": "interrupted: Stopped.",
+        "c": "running",
+    }
+
+    with pytest.raises(UserError) as refused:
+        collect(tmp_path)
+
+    listed = [f"{tmp_path}/{name}/fps-32-pointnet ({why})" for name, why in reasons.items()]
+    assert str(refused.value) == (
+        f"{tmp_path}: none of its 4 runs has a full result: {'; '.join(listed)}."
+    )
+
+
+def test_collect_sorts_runs_by_folder(tmp_path):
+    for name in ("c", "a", "b"):
+        put(tmp_path / name, "fps", 32, {"test/sampled/accuracy": 0.3})
+
+    folders = [record.folder for record in collect(tmp_path).done]
+
+    assert folders == [f"{tmp_path}/{name}/fps-32-pointnet" for name in ("a", "b", "c")]

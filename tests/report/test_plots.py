@@ -128,3 +128,75 @@ def test_curves_have_a_legend_of_all_rows(tmp_path):
 
     legend: Any = figure.axes[-1].get_legend()
     assert [text.get_text() for text in legend.get_texts()] == ["fps", "samplenet", "mops"]
+
+
+def test_curves_of_samplers_that_choose_input_points_are_dashed(tmp_path):
+    for m in (8, 32):
+        put(tmp_path, "fps", m, {"test/sampled/accuracy": 0.4})
+        put(tmp_path, "mops", m, {"test/generated/accuracy": 0.5})
+
+    (figure,) = plots(build_report(tmp_path)).values()
+
+    generated, matched, _ = figure.axes
+    assert [container.lines[0].get_linestyle() for container in generated.containers] == ["--", "-"]
+    assert [container.lines[0].get_linestyle() for container in matched.containers] == ["--"]
+    assert generated.get_xlabel() == "m"
+    assert generated.get_ylabel() == "accuracy (%)"
+    assert [label.get_text() for label in generated.get_xticklabels()] == ["8", "32"]
+
+
+@pytest.mark.parametrize(("columns", "shape"), [(8, (1, 3)), (9, (3, 1))])
+def test_panels_of_more_than_eight_columns_are_stacked(columns, shape, tmp_path):
+    for number in range(columns):
+        noise = {"test_noise_std": number / 100}
+        put(tmp_path / f"{number}", "fps", 32, {"test/sampled/accuracy": 0.4}, config=noise)
+
+    (figure,) = plots(build_report(tmp_path)).values()
+
+    grid: Any = figure.axes[0].get_gridspec()
+    assert (grid.nrows, grid.ncols) == shape
+
+
+def test_figures_of_a_single_column_are_not_drawn(tmp_path):
+    put(tmp_path, "fps", 32, {"test/sampled/accuracy": 0.4})
+
+    assert plots(build_report(tmp_path)) == {}
+
+
+def test_heat_maps_show_percentages_of_each_cell_under_the_names_of_the_settings(tmp_path):
+    values = {(1, 0.5): 0.1, (1, 0.9): 0.2, (10, 0.9): 0.4}
+    for number, ((alpha, tau), value) in enumerate(values.items()):
+        of = {"alpha": alpha, "tau": tau}
+        scores = {"test/generated/accuracy": value}
+        put(tmp_path / f"{number}", "mops", 32, scores, of=of)
+
+    figure = plots(build_report(tmp_path))["accuracy_planes"]
+
+    axes, bar = figure.axes
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("tau", "alpha")
+    assert axes.get_title() == "mops, generated"
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["0.5", "0.9"]
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["1", "10"]
+    shown = {text.get_position(): (text.get_text(), text.get_color()) for text in axes.texts}
+    assert shown == {
+        (0, 0): ("10", "white"),  # on the dark end of the colours
+        (1, 0): ("20", "white"),
+        (1, 1): ("40", "black"),
+    }
+    norm = axes.images[0].norm
+    assert (norm.vmin, norm.vmax) == (10, 40)
+    assert bar.get_ylabel() == "accuracy (%)"
+
+
+@pytest.mark.parametrize(("ratio", "kind"), [(20, Normalize), (21, LogNorm)])
+def test_heat_maps_are_logarithmic_beyond_twenty_times_the_smallest_value(ratio, kind, tmp_path):
+    for down, across in itertools.product((1, 2), (1, 2)):
+        value = 1.0
+        if (down, across) == (2, 2):
+            value = ratio
+        of = {"alpha": down, "tau": across}
+        put_cell(tmp_path, f"{down}{across}", "mops", {"generated": value}, of=of)
+
+    (figure,) = plots(build_report(tmp_path)).values()
+
+    assert type(figure.axes[0].images[0].norm) is kind

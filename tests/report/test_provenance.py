@@ -2,7 +2,8 @@
 
 import pytest
 
-from mops_lightning.report.provenance import collapses, provenance
+from mops_lightning.report.collect import Found
+from mops_lightning.report.provenance import collapses, provenance, without_result
 from tests.support.records import evaluated, record
 
 
@@ -60,3 +61,37 @@ TRAINED = {"fit": 1.0, "total": 1.0}
 )
 def test_provenance_says_how_a_run_was_made(changes, line):
     assert provenance([record(**{"threads": 2, **changes})], "pointnet") == [line]
+
+
+@pytest.mark.parametrize(("number", "are_named"), [(8, True), (9, False)])
+def test_provenance_names_the_runs_of_a_way_up_to_eight(number, are_named):
+    names = [f"run{place}" for place in range(number)]
+    short = [record(folder=f"runs/{name}", seconds=TRAINED, threads=2) for name in names]
+    long = record(folder="runs/long", seconds=TRAINED, threads=1)
+
+    first, second = provenance([*short, long], "pointnet")
+
+    named = f" ({', '.join(names)})" if are_named else ""
+    assert first == f"- mops{named}: 3 epochs, seed 0, cpu, 2 threads, commit 0123456789"
+    assert second == "- mops (long): 3 epochs, seed 0, cpu, 1 thread, commit 0123456789"
+
+
+def test_provenance_of_an_evaluated_joint_training_does_not_say_that_it_trained():
+    again = record(evaluated=evaluated(learn="joint", max_epochs=1), threads=2)
+
+    assert provenance([again], "pointnet") == [
+        "- mops: evaluated after 1 epoch, seed 0, cpu, 2 threads, commit 0123456789"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("undone", "head"),
+    [
+        ({"a": "failed"}, "1 of 3 runs has no full result:"),
+        ({"a": "failed", "b": "running"}, "2 of 4 runs have no full result:"),
+    ],
+)
+def test_without_result_counts_all_runs(undone, head):
+    lines = without_result(Found([record(), record()], undone))
+
+    assert lines == ["", head, "", *[f"- {run}: {why}" for run, why in undone.items()]]

@@ -3,7 +3,7 @@ import shutil
 from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.report.collect import sampler_row
 from mops_lightning.report.long_form import long_form
-from mops_lightning.report.rows import RowNames
+from mops_lightning.report.rows import RowNames, sort_key
 from mops_lightning.report.tables import over_seeds
 from tests.support.records import NAMES, evaluated, record
 from tests.support.reports import edited, put, put_cell, rows, table
@@ -335,3 +335,80 @@ def test_own_samplers_in_one_table_are_told_apart_by_class_setting_and_module(tm
         ["Median old_lab.Median", "40.00"],
     ]
     assert "not shown" not in text
+
+
+PAPERS_ORDER = [
+    "random",
+    "serial",
+    "voxel",
+    "fps",
+    "poisson",
+    "normal_space",
+    "covariance",
+    "information",
+    "steady",
+    "pose",
+    "critical",
+    "submodular",
+    "gumbel",
+    "snet",
+    "samplenet",
+    "samplenet_progressive",
+    "mops",
+    "mops fast",
+    "fmops",
+    "apes",
+    "dgcnn on random",
+]
+
+
+def test_rows_are_in_the_papers_order_then_others_then_those_of_other_nets():
+    assert sorted(reversed(PAPERS_ORDER), key=sort_key) == PAPERS_ORDER
+
+
+def test_title_of_a_table_by_another_setting_names_the_sizes_from_the_smallest(tmp_path):
+    for m, noise in ((32, 0.0), (8, 0.0), (32, 0.1), (8, 0.1)):
+        values = {"generated": m + noise}
+        sampler = "mops"
+        if m == 8:
+            sampler = "snet"
+        put_cell(tmp_path, f"{m}-{noise}", sampler, values, m=m, test_noise_std=noise)
+
+    titles = [line for line in table(tmp_path).splitlines() if line.startswith("Test ")]
+
+    assert [title.rpartition("(m ")[2] for title in titles] == ["32)", "8)"]
+    assert ", m=32, under autoencoder;" in titles[0]
+
+
+def test_plane_has_only_the_columns_of_its_sampler_and_no_factor_from_zero(tmp_path):
+    for sampler, taus in (("mops", (0.5, 0.9)), ("snet", (0.5, 0.7))):
+        for alpha, tau in ((1, taus[0]), (2, taus[1])):
+            values = {"generated": alpha - 1.0}
+            of = {"alpha": alpha, "tau": tau}
+            put_cell(tmp_path, f"{sampler}{alpha}", sampler, values, of=of)
+
+    text = table(tmp_path)
+
+    assert rows(text) == [
+        ["alpha \\ tau", "0.5", "0.7"],
+        ["1", "0", ""],
+        ["2", "", "1"],
+        ["alpha \\ tau", "0.5", "0.9"],
+        ["1", "0", ""],
+        ["2", "", "1"],
+    ]
+    assert "Spread over the plane of mops: generated 0 to 1." in text
+
+
+def test_costs_of_a_sampler_of_many_sizes_are_of_its_largest_one(tmp_path):
+    """Two trainings for the same largest size, tested at two sizes, cost as much as one."""
+    for m in (8, 32):
+        put_cell(tmp_path, f"{m}", "fmops", {"generated": 1.0}, m=m, cost=100.0, of={"m_max": 64})
+
+    assert rows(table(tmp_path))[1][-1] == "100 s"
+
+
+def test_deviation_of_numbers_with_an_exponent_has_two_decimals():
+    metric = MetricInfo("error", higher_is_better=False)
+
+    assert over_seeds(metric, 1.25e-7, 0.5) == "1.25e-07 ± 0.50"
