@@ -1,6 +1,7 @@
-"""Tables of what is declared of every setting, as help, resuming, evaluations and reports use it."""
+"""Tables of what settings declare, as help, resuming, evaluations and reports use it."""
 
 import math
+from typing import Any
 
 import pytest
 
@@ -266,7 +267,7 @@ def test_undeclared_setting_is_declared_by_its_group(path, group):
     assert settings.of(path) == settings.of(group)
 
 
-LIMITS = {
+LIMITS: dict[str, tuple[list[Any], list[Any]]] = {
     "m": ([1], [0, 1.0, None]),
     "sizes": (["auto", [1]], ["all", 8, [], [0], [8, 1.5]]),
     "learn": (["task", "sampler", "joint", "nothing"], ["both", None]),

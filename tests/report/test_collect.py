@@ -1,4 +1,5 @@
 import os
+from typing import Any
 
 import pytest
 
@@ -79,7 +80,7 @@ def test_collect_named_pipe_is_skipped(tmp_path):
 
 def test_collect_says_why_runs_have_no_result_and_lists_three(tmp_path):
     part = ["trained for 1 of 2 steps", "tested on 1 of 4 batches"]
-    changes = {
+    changes: dict[str, dict[str, Any]] = {
         "a": {"status": "failed", "error": "UserError: m is wrong", "partial": part},
         "b": {"status": "interrupted", "error": "Stopped."},
         "c": {"status": "running"},

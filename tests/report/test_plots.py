@@ -65,6 +65,11 @@ def curves_of(axes: Any) -> list[list[float]]:
     return [container.lines[0].get_ydata().tolist() for container in axes.containers]
 
 
+def styles_of(axes: Any) -> list[str]:
+    """The line styles of all curves of a panel."""
+    return [container.lines[0].get_linestyle() for container in axes.containers]
+
+
 def test_curves_of_two_groups_have_names_of_their_own(tmp_path):
     for fingerprint, value in (("first", 0.3), ("second", 0.6)):
         for m in (8, 32):
@@ -138,8 +143,8 @@ def test_curves_of_samplers_that_choose_input_points_are_dashed(tmp_path):
     (figure,) = plots(build_report(tmp_path)).values()
 
     generated, matched, _ = figure.axes
-    assert [container.lines[0].get_linestyle() for container in generated.containers] == ["--", "-"]
-    assert [container.lines[0].get_linestyle() for container in matched.containers] == ["--"]
+    assert styles_of(generated) == ["--", "-"]
+    assert styles_of(matched) == ["--"]
     assert generated.get_xlabel() == "m"
     assert generated.get_ylabel() == "accuracy (%)"
     assert [label.get_text() for label in generated.get_xticklabels()] == ["8", "32"]

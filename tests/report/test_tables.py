@@ -363,21 +363,11 @@ PAPERS_ORDER = [
 
 
 def test_rows_are_in_the_papers_order_then_others_then_those_of_other_nets():
-    assert sorted(reversed(PAPERS_ORDER), key=sort_key) == PAPERS_ORDER
+    shuffled = PAPERS_ORDER[::-1]
 
+    shuffled.sort(key=sort_key)
 
-def test_title_of_a_table_by_another_setting_names_the_sizes_from_the_smallest(tmp_path):
-    for m, noise in ((32, 0.0), (8, 0.0), (32, 0.1), (8, 0.1)):
-        values = {"generated": m + noise}
-        sampler = "mops"
-        if m == 8:
-            sampler = "snet"
-        put_cell(tmp_path, f"{m}-{noise}", sampler, values, m=m, test_noise_std=noise)
-
-    titles = [line for line in table(tmp_path).splitlines() if line.startswith("Test ")]
-
-    assert [title.rpartition("(m ")[2] for title in titles] == ["32)", "8)"]
-    assert ", m=32, under autoencoder;" in titles[0]
+    assert shuffled == PAPERS_ORDER
 
 
 def test_plane_has_only_the_columns_of_its_sampler_and_no_factor_from_zero(tmp_path):
