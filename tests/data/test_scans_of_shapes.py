@@ -118,6 +118,41 @@ def test_scans_are_those_of_published_figures(name, distances, intensity, counts
     assert {part: int((parts == part).sum()) for part in counts} == counts
 
 
+SEEN = {
+    "airplane": (
+        (-0.0016, 0.0339, 0.1632),
+        {"engine": 2, "hull": 30, "tail": 5, "wing": 19},
+        (0.3780, 0.3604, 0.3305),
+    ),
+    "bottle": ((0.0474, 0.1136, -0.1799), {"object": 205}, (0.4024, 0.3971, 0.2990)),
+    "chair": (
+        (0.0836, 0.1338, -0.0479),
+        {"arm": 7, "back": 94, "leg": 31, "seat": 36},
+        (0.4692, 0.3204, 0.3211),
+    ),
+    "lamp": (
+        (-0.0925, 0.1083, 0.0931),
+        {"base": 44, "pole": 9, "shade": 84},
+        (0.2583, 0.4597, 0.2946),
+    ),
+}
+"""Over the same scans: the mean point, points on parts of the shape, and mean intensities."""
+
+
+@pytest.mark.parametrize("name", SEEN)
+def test_scans_see_the_sides_and_parts_of_published_ones(name):
+    scans = [scan(name, 256, 0.1, 0.01, number) for number in range(4)]
+
+    points = np.concatenate([found.points for found in scans])
+    parts = np.concatenate([found.parts for found in scans])
+    intensities = np.concatenate([found.intensities for found in scans])
+    middle, counts, intensities_of_surroundings = SEEN[name]
+    assert points.mean(0) == pytest.approx(middle, abs=1e-4)
+    assert {part: int((parts == part).sum()) for part in counts} == counts
+    means = [intensities[parts == part].mean() for part in ("floor", "clutter", "outlier")]
+    assert means == pytest.approx(intensities_of_surroundings, abs=1e-4)
+
+
 def test_scan_without_noise_has_its_points_on_surfaces():
     found = scan(outliers=0.0)
 

@@ -1,8 +1,11 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from mops_lightning.files import compare
 from mops_lightning.files.compare import compare_file, ground_error, options_by_method
+from mops_lightning.files.options import Options
 from tests.support.cloud_files import write_cloud
 from tests.support.clouds import normal_points
 
@@ -141,3 +144,46 @@ def test_compare_file_samples_once_before_it_measures_time(tmp_path, monkeypatch
     compare_file(path, 60, methods, 0)
 
     assert sizes == [120, 700, 120, 700]
+
+
+def test_page_shows_the_input_and_the_last_method_with_z_upwards(tmp_path):
+    points = np.array([[5.0, 0.0, 0.0], [7.0, 0.0, 0.0], [6.0, 2.0, 0.0], [6.0, -2.0, 4.0]])
+    measures = {"chamfer": 0.0, "hausdorff": 0.0, "density": 0.0, "ground": None, "seconds": 0.0}
+    results = [
+        compare.Result("fps", np.array([0, 3]), **measures),
+        compare.Result("trained", np.array([2, 1]), **measures),
+    ]
+    compared = compare.FileResult(Path("scans/room.ply"), points, 2, results)
+
+    clouds = compare._clouds(compared)
+
+    # About the mean (6, 0, 1), divided by the largest coordinate, 3; y goes to the back.
+    whole = [[-0.333, -0.333, 0.0], [0.333, -0.333, 0.0], [0.0, -0.333, -0.667], [0.0, 1.0, 0.667]]
+    assert np.array(clouds["points"]["input"][0]) == pytest.approx(np.array(whole))
+    assert np.array(clouds["points"]["fps"][0]) == pytest.approx(np.array([whole[0], whole[3]]))
+    assert np.array(clouds["points"]["trained"][0]) == pytest.approx(np.array([whole[2], whole[1]]))
+    assert clouds["name"] == "room.ply, 2 points"
+    assert clouds["titles"] == ["room"]
+    assert clouds["colours"] == {"input": "lightgrey"}
+    assert clouds["hidden"] == ["fps"]
+
+
+def test_page_shows_a_cloud_of_one_place(tmp_path):
+    measures = {"chamfer": 0.0, "hausdorff": 0.0, "density": 0.0, "ground": None, "seconds": 0.0}
+    result = compare.Result("fps", np.array([0]), **measures)
+    compared = compare.FileResult(Path("a.ply"), np.full((2, 3), 7.0), 1, [result])
+
+    clouds = compare._clouds(compared)
+
+    assert clouds["points"]["fps"] == [[[0.0, 0.0, 0.0]]]
+
+
+def test_methods_of_a_comparison_have_its_seed_and_the_trained_one_its_tile():
+    methods = options_by_method(8, ["random", "fps"], "weights.pt", 64, 3)
+
+    assert methods == {
+        "fps": Options(8, method="fps", seed=3),
+        "random": Options(8, method="random", seed=3),
+        "trained": Options(8, "weights.pt", seed=3, tile=64),
+    }
+    assert list(methods) == ["fps", "random", "trained"]

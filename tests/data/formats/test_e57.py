@@ -7,6 +7,7 @@ import numpy as np
 import pye57
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from pye57 import libe57
 
 from mops_lightning.data.formats import e57, splats
 from mops_lightning.errors import UserError
@@ -77,6 +78,80 @@ def test_cartesian_of_ranges_azimuths_and_elevations():
 
     expected = [[2, 0, 0], [0, 2, 0], [1, 1, np.sqrt(2)], [0, 0, -2]]
     assert_allclose(points, expected, atol=1e-12)
+
+
+def write_fields(path, fields, **extensions):
+    """Write one scan with any fields, each as float64, which pye57 itself does not write."""
+    with pye57.E57(str(path), mode="w") as file:
+        image = file.image_file
+        for prefix, address in extensions.items():
+            image.extensionsAdd(prefix, address)
+        prototype = libe57.StructureNode(image)
+        buffers = libe57.VectorSourceDestBuffer()
+        number = len(next(iter(fields.values())))
+        for name, values in fields.items():
+            prototype.set(name, libe57.FloatNode(image, 0.0))
+            buffers.append(libe57.SourceDestBuffer(image, name, values, number, True, True))
+        codecs = libe57.VectorNode(image, True)
+        points = libe57.CompressedVectorNode(image, prototype, codecs)
+        scan_node = libe57.StructureNode(image)
+        scan_node.set("guid", libe57.StringNode(image, "{1}"))
+        scan_node.set("points", points)
+        file.data3d.append(scan_node)
+        points.writer(buffers).write(number)
+
+
+FIELDS = {
+    "intensity": ("intensity", np.float32, 0.5),
+    "colorRed": ("red", np.uint8, 1),
+    "colorGreen": ("green", np.uint8, 2),
+    "colorBlue": ("blue", np.uint8, 3),
+    "rowIndex": ("row", np.uint16, 1004),
+    "columnIndex": ("column", np.int32, 100_005),
+    "returnIndex": ("return_index", np.uint8, 6),
+    "returnCount": ("return_count", np.uint8, 7),
+    "timeStamp": ("time", np.float64, 3e8 + 0.1),
+    "nor:normalX": ("nx", np.float32, 0.0),
+    "nor:normalY": ("ny", np.float32, 0.625),
+    "nor:normalZ": ("nz", np.float32, -1.0),
+}
+"""Every field that is read, with its column, the type of this and a number."""
+
+
+def test_every_field_of_a_scan_has_its_column(tmp_path):
+    path = tmp_path / "a.e57"
+    fields = {}
+    for place, axis in enumerate(AXES):
+        fields[axis] = np.array([1.5, -2.5]) + 10 * place
+    for field, (_, _, number) in FIELDS.items():
+        fields[field] = np.full(2, float(number))
+    fields["cartesianInvalidState"] = np.array([0.0, 0.0])
+    fields["isColorInvalid"] = np.array([0.0, 0.0])
+    write_fields(path, fields, nor="http://www.libe57.org/E57_NOR_surface_normals.txt")
+
+    table = contents(path)
+
+    assert table.points.tolist() == [[1.5, 11.5, 21.5], [-2.5, 7.5, 17.5]]
+    found = {name: (column.dtype, column.tolist()) for name, column in table.columns.items()}
+    assert found == {name: (np.dtype(kind), [value] * 2) for name, kind, value in FIELDS.values()}
+    assert table.form.left_out == ("isColorInvalid",)
+
+
+def test_spherical_scan_is_read_without_its_invalid_points(tmp_path):
+    path = tmp_path / "a.e57"
+    quarter = np.pi / 2
+    fields = {
+        "sphericalRange": np.array([2.0, 2.0, 2.0, 2.0]),
+        "sphericalAzimuth": np.array([0.0, quarter, 0.0, 0.0]),
+        "sphericalElevation": np.array([0.0, 0.0, quarter, 0.0]),
+        "sphericalInvalidState": np.array([0.0, 0.0, 0.0, 1.0]),
+    }
+    write_fields(path, fields)
+
+    points = contents(path).points
+
+    assert_allclose(points[:3], [[2, 0, 0], [0, 2, 0], [0, 0, 2]], atol=1e-12)
+    assert np.isnan(points[3]).all()
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from mops_lightning.files.icp.align import (
     pose_difference,
     prepare_source,
     prepare_target,
+    small_gicp,
     timed_error,
 )
 from mops_lightning.files.icp.measure import Setup, compare_by_icp
@@ -57,6 +58,58 @@ def test_source_has_covariances_of_planes_for_gicp():
     # small_gicp sets the variances to 1 along the plane, and to 0.001 across it.
     variances = np.linalg.eigvalsh(covariances[:, :3, :3])
     assert variances == pytest.approx(np.tile([0.001, 1, 1], (50, 1)))
+
+
+def test_target_has_the_normals_of_twelve_neighbours():
+    points = uniform_points(60, 0)
+
+    normals = prepare_target(points).cloud.normals()[:, :3]
+
+    distances = np.linalg.norm(points[:, None] - points, axis=2)
+    for row, normal in enumerate(normals):
+        near = points[distances[row].argsort()[:12]]
+        values, axes = np.linalg.eigh(np.cov(near.T))
+        assert abs(axes[:, 0] @ normal) == pytest.approx(1, abs=1e-3)
+
+
+def test_align_goes_on_until_the_pose_no_longer_changes():
+    points = uniform_points(500, 0) * [4, 3, 2]
+    target = prepare_target(points)
+    turn = Rotation.from_euler("xyz", [12, -9, 14], degrees=True).as_matrix()
+    start = np.eye(4)
+    start[:3, :3] = turn
+
+    found = align(target, prepare_source(points, "gicp"), start, "gicp", max_distance=3.0)
+
+    degrees, shift = pose_difference(found, np.eye(4), points.mean(0))
+    assert degrees < 0.01
+    assert shift < 1e-3
+
+
+def test_registrations_are_those_of_their_names():
+    points = uniform_points(300, 0) * [1, 1, 0.3]
+    target = prepare_target(points[::2])
+    source = prepare_source(points[1::2], "gicp")
+
+    by_plane = align(target, source, np.eye(4), "plane", max_distance=0.5)
+    by_gicp = align(target, source, np.eye(4), "gicp", max_distance=0.5)
+
+    expected = {}
+    for name in ("PLANE_ICP", "GICP"):
+        result = small_gicp().align(
+            target.cloud,
+            source,
+            target.tree,
+            registration_type=name,
+            max_correspondence_distance=0.5,
+            max_iterations=200,
+            rotation_epsilon=1e-6,
+            translation_epsilon=1e-6,
+        )
+        expected[name] = result.T_target_source
+    assert by_plane == pytest.approx(expected["PLANE_ICP"], abs=1e-3)
+    assert by_gicp == pytest.approx(expected["GICP"], abs=1e-3)
+    assert not np.allclose(by_plane, by_gicp, atol=1e-2)
 
 
 def test_score_is_the_median_over_all_starts():

@@ -76,6 +76,9 @@ def test_crops_give_a_row_for_every_method_size_registration_and_draw(scans, tmp
     voxels = numbers_of(rows, "points", "small_gicp_voxel")
     assert min(voxels) >= 10
     assert max(voxels) <= 40
+    assert {row["sampling"] for row in rows if row["method"] == "all points"} == {"0.0"}
+    assert min(numbers_of(rows, "sampling", "information")) > 0
+    assert min(numbers_of(rows, "aligning")) > 0
     printed = capsys.readouterr().out
     assert "plane, 16 points: 2 draws of 4 alignments" in printed
     assert "against fps_farthest" in printed
@@ -92,6 +95,39 @@ def test_two_runs_of_one_seed_find_the_same_errors(scans, tmp_path):
 
     assert found[0] == found[1]
     assert len(found[0]) == 2 * (1 + 11)
+
+
+def errors_of_all_points(scans, out, seed):
+    """Return the rotation error of each draw, where starts are the truth: it is that of crops."""
+    called("--task", "icp", scans, "--m", 10, "--draws", 2, "--crops", 1, "--points", 200,
+           "--methods", "random", "--registration", "gicp", "--angle", 0, "--shift", 0,
+           "--seed", seed, "--out", out)  # fmt: skip
+    return numbers_of(rows_of(out), "degrees", "all points")
+
+
+def test_crops_are_those_of_the_draw_and_of_the_seed(scans, tmp_path):
+    of_first_seed = errors_of_all_points(scans, tmp_path / "0", 0)
+    of_other_seed = errors_of_all_points(scans, tmp_path / "1", 1)
+
+    assert len({*of_first_seed, *of_other_seed}) == 4
+
+
+def test_starts_are_those_of_the_seed_for_the_same_frames(tmp_path):
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    poses = tmp_path / "poses.txt"
+    poses.write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 2)
+    for number in range(2):
+        write_cloud(folder / f"{number}.ply", room(300, number))
+
+    found = []
+    for seed in (0, 1):
+        out = tmp_path / str(seed)
+        called("--task", "icp", folder, "--poses", poses, "--m", 10, "--draws", 1, "--methods",
+               "random", "--registration", "gicp", "--seed", seed, "--out", out)  # fmt: skip
+        found += numbers_of(rows_of(out), "degrees", "all points")
+
+    assert found[0] != found[1]
 
 
 def test_frames_with_poses_are_aligned_to_the_true_motion(tmp_path, capsys):

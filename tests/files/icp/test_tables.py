@@ -35,6 +35,16 @@ def test_grid_has_means_spreads_and_paired_differences():
     (grid,) = grids_of(frame)
 
     assert grid.title == "plane, 16 points: 2 draws of 4 alignments"
+    assert grid.head == [
+        "method",
+        "points",
+        "rotation error (deg)",
+        "against fps_farthest (%)",
+        "below 2 deg (%)",
+        "shift error",
+        "sampling (ms)",
+        "aligning (ms)",
+    ]
     common = ["25.0 ± 0.0", "0.5000 ± 0.0000", "1.00", "2.00"]
     assert grid.rows == [
         ["fps_farthest", "16", "2.000 ± 1.414", "-", *common],
