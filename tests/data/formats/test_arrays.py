@@ -6,7 +6,8 @@ import laspy
 import numpy as np
 import pytest
 
-from mops_lightning.data.formats.registry import open_cloud_file
+from mops_lightning.data.formats.registry import open_cloud_file, write
+from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import UserError
 from tests.support.cloud_files import contents, write_table
 
@@ -154,3 +155,62 @@ def test_npy_fields_in_another_byte_order_come_in_native_order(tmp_path):
     assert table.points.tolist() == [[1.5, 2.5, 3.5]]
     assert table.columns["label"].tolist() == [70_000]
     assert table.columns["label"].dtype.isnative
+
+
+@pytest.mark.parametrize("name", ["points", "xyz", "pos", "positions", "the_only_one"])
+def test_npz_points_have_one_of_four_names_or_any_if_alone(name, tmp_path):
+    path = tmp_path / "a.npz"
+    arrays: dict[str, Any] = {name: np.eye(3)}
+    if name != "the_only_one":
+        arrays["score"] = np.arange(3.0)
+    np.savez(path, **arrays)
+
+    table = contents(path)
+
+    assert table.points.tolist() == np.eye(3).tolist()
+    assert list(table.columns) == [other for other in arrays if other != name]
+
+
+def test_npz_column_named_as_the_points_is_kept_beside_them(tmp_path):
+    path = tmp_path / "a.npz"
+
+    write_table(path, Table(np.eye(3), {"points": np.arange(3)}))
+
+    arrays = np.load(path)
+    assert arrays["points"].tolist() == np.eye(3).tolist()
+    assert arrays["points_"].tolist() == [0, 1, 2]
+
+
+def test_npz_fields_and_arrays_that_are_no_numbers_are_named(tmp_path):
+    path = tmp_path / "a.npz"
+    fields = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("name", "U3")]
+    np.savez(path, points=np.zeros(3, fields), pose=np.eye(4))
+
+    assert contents(path).form.left_out == ("name", "pose")
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        (["column_3"], ""),
+        (["column_3", "red"], "its columns are x, y, z, column_3, red, without names in the file"),
+    ],
+)
+def test_npy_says_which_names_it_does_not_hold(names, said, tmp_path, capsys):
+    columns = {name: np.zeros(3) for name in names}
+
+    write(tmp_path / "a.npy", Table(np.eye(3), columns))
+
+    out = capsys.readouterr().out
+    assert said in out
+    assert bool(out) == bool(said)
+
+
+def test_what_a_format_lacks_is_said_beside_what_the_source_lost(tmp_path, capsys):
+    source = tmp_path / "a.npz"
+    np.savez(source, points=np.eye(3), score=np.zeros(3), names=["a", "b", "c"])
+
+    write(tmp_path / "a.bin", contents(source))
+
+    out = capsys.readouterr().out
+    assert out.endswith("a.bin: no room for score: .bin holds x, y, z, intensity; without names\n")

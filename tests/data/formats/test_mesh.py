@@ -119,6 +119,10 @@ BROKEN = {
     "cloud.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "has no faces"),
     "line.off": (b"OFF\n3 1 0\n0 0 0\n1 1 1\n2 2 2\n3 0 1 2\n", "area zero"),
     "thin.off": (b"OFF\n3 1 0\n.1 .2 .3\n.2 .4 .6\n.3 .6 .9\n3 0 1 2\n", "area zero"),
+    "long.off": (
+        b"OFF\n3 1 0\n1e6 2e6 3e6\n2e6 4e6 6e6\n3.3e6 6.6e6 9.9e6\n3 0 1 2\n",
+        "area zero",
+    ),
     "point.off": (b"OFF\n3 1 0\n1 1 1\n1 1 1\n1 1 1\n3 0 1 2\n", "area zero"),
     "nan.obj": (TRIANGLE.format("nan", 3).encode(), "not all finite"),
     "huge.obj": (TRIANGLE.format("1e308", 3).replace("1 0", "1e308 0").encode(), "not all finite"),
@@ -163,6 +167,15 @@ def test_ascii_stl_normals_of_the_file_are_ignored(normal):
     mesh = parse_mesh(text.encode(), Path("a.stl"))
 
     assert_allclose(mesh.face_normals, [[0, 0, 1]])
+
+
+@pytest.mark.parametrize("size", [1e-9, 1.0, 1e9])
+def test_small_and_large_meshes_are_not_flat(size):
+    text = f"OFF\n3 1 0\n0 0 0\n{size} 0 0\n0 {size / 1000} 0\n3 0 1 2\n"
+
+    mesh = parse_mesh(text.encode(), Path("a.off"))
+
+    assert float(mesh.area) == pytest.approx(size**2 / 2000)
 
 
 def test_obj_of_many_materials_is_read(tmp_path):

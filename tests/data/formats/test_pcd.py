@@ -7,6 +7,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from mops_lightning.data.formats import pcd
+from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import UserError
 from tests.support.cloud_files import contents
 
@@ -177,3 +178,71 @@ def test_pcd_fields_of_several_numbers_are_kept(tmp_path):
 
     assert list(table.columns) == ["fpfh_0", "fpfh_1"]
     assert table.columns["fpfh_1"].tolist() == [0.25, 1.25, 2.25]
+
+
+def test_pcd_header_in_small_letters_is_read(tmp_path):
+    path = tmp_path / "a.pcd"
+    head = "fields x y z t\nsize 4 4 4 2\ntype F F F U\nwidth 2\nheight 1\npoints 2\n"
+    path.write_text(f"{head}data ascii\n1 2 3 7\n4 5 6 8\n")
+
+    table = contents(path)
+
+    assert table.points.tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert table.columns["t"].tolist() == [7, 8]
+
+
+def test_pcd_is_written_with_a_complete_header(tmp_path):
+    path = tmp_path / "a.pcd"
+    columns = {
+        "signed": np.array([-1, 2], np.int16),
+        "long": np.array([1, 2**40]),
+        "bytes": np.array([3, 4], np.uint8),
+        "score": np.array([0.5, 1.5]),
+    }
+
+    pcd.write(path, Table(np.arange(6.0).reshape(2, 3), columns))
+
+    head, _, rows = path.read_bytes().partition(b"DATA binary\n")
+    assert head.decode().splitlines() == [
+        "# .PCD v0.7 - Point Cloud Data file format",
+        "VERSION 0.7",
+        "FIELDS x y z signed long bytes score",
+        "SIZE 4 4 4 2 8 1 8",
+        "TYPE F F F I I U F",
+        "COUNT 1 1 1 1 1 1 1",
+        "WIDTH 2",
+        "HEIGHT 1",
+        "VIEWPOINT 0 0 0 1 0 0 0",
+        "POINTS 2",
+    ]
+    assert rows == struct.pack("<3fhqBd", 0, 1, 2, -1, 1, 3, 0.5) + struct.pack(
+        "<3fhqBd", 3, 4, 5, 2, 2**40, 4, 1.5
+    )
+
+
+def test_pcd_field_whose_name_is_taken_is_written_by_its_numbers(tmp_path):
+    source = tmp_path / "a.pcd"
+    out = tmp_path / "b.pcd"
+    head = "FIELDS x y z f\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 2\nWIDTH 1\nPOINTS 1\n"
+    source.write_text(f"{head}DATA ascii\n1 2 3 4 5\n")
+    table = contents(source)
+
+    pcd.write(out, table.with_columns({"f": np.array([9.0])}))
+
+    columns = contents(out).columns
+    assert {name: column.tolist() for name, column in columns.items()} == {
+        "f_0": [4],
+        "f_1": [5],
+        "f": [9],
+    }
+
+
+def test_pcd_without_a_viewpoint_gets_one_without_a_turn(tmp_path):
+    source = tmp_path / "a.pcd"
+    out = tmp_path / "b.pcd"
+    head = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 1\nPOINTS 1\n"
+    source.write_text(f"{head}DATA ascii\n1 2 3\n")
+
+    pcd.write(out, contents(source))
+
+    assert b"\nVIEWPOINT 0 0 0 1 0 0 0\n" in out.read_bytes()

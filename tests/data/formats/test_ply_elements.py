@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
+from mops_lightning.data.formats.ply import parse_mesh
 from mops_lightning.data.formats.registry import open_cloud_file, read
 from mops_lightning.errors import UserError
 from tests.support.cloud_files import contents
@@ -127,3 +128,56 @@ def test_corners_of_faces_are_their_indices_and_not_the_first_list(tmp_path):
     assert_array_equal(table.points[:, 2], np.full(50, 7.0))
     assert table.points[:, :2].sum(1).max() <= 1
     assert_array_equal(table.columns["nz"], np.ones(50))
+
+
+COUNTS = ["char", "uchar", "short", "ushort", "int", "uint"]
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+@pytest.mark.parametrize("count", COUNTS)
+def test_polygons_of_any_number_of_corners_are_cut_into_triangles(count, form, tmp_path):
+    """A pentagon and a triangle over it, whose lists differ in length."""
+    path = tmp_path / "a.ply"
+    corners = [(0, 0, 0), (4, 0, 0), (4, 2, 0), (2, 4, 0), (0, 4, 0)]
+    faces = [(5, 0, 1, 2, 3, 4), (3, 0, 1, 2)]
+    lists = f"element face 2\nproperty list {count} int vertex_indices\n"
+    text = head(form, "element vertex 5\n", AXES, lists)
+    if form == "ascii":
+        rows = [" ".join(map(str, row)) for row in (*corners, *faces)]
+        content = "\n".join(rows).encode()
+    else:
+        order = ">" if "big" in form else "<"
+        content = b"".join(struct.pack(f"{order}3f", *corner) for corner in corners)
+        letter, _ = TYPES[count]
+        for face in faces:
+            content += struct.pack(f"{order}{letter}{face[0]}i", *face)
+    path.write_bytes(text.encode() + content)
+
+    mesh = parse_mesh(path.read_bytes(), path)
+
+    expected = [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 1, 2]]
+    assert mesh.faces.tolist() == expected
+    assert mesh.table.points.tolist() == [list(corner) for corner in corners]
+
+
+def test_ascii_rows_that_are_missing_are_counted_in_their_element(tmp_path):
+    path = tmp_path / "a.ply"
+    text = head("ascii", *TWO_CLOUDS)
+    path.write_text(text + "0 0 0\n" * 4)
+
+    with pytest.raises(UserError, match="says 3 rows of vertex, it has 2"):
+        contents(path)
+
+
+def test_elements_without_rows_or_points_are_not_named(tmp_path):
+    path = tmp_path / "a.ply"
+    plane = "element plane 2\nproperty float x\nproperty float y\n"
+    lists = "element lists 1\n" + "".join(f"property list uchar int {axis}\n" for axis in "xyz")
+    empty = "element empty 0\nproperty float w\n"
+    text = head("ascii", plane, lists, empty, "element point 1\n", AXES)
+    path.write_text(f"{text}1 2\n3 4\n1 7 1 8 1 9\n4 5 6\n")
+
+    table = contents(path)
+
+    assert table.points.tolist() == [[4, 5, 6]]
+    assert table.form.left_out == ("element plane", "element lists")

@@ -85,7 +85,7 @@ def test_area_of_remote_file_equals_local_file(options, server, tmp_path):
 
     size = local_file.stat().st_size
     assert sum(sent) < 0.25 * size
-    assert f"of {size / 1e6:,.1f} MB" in out
+    assert f"reading {sum(sent) / 1e6:,.1f} of {size / 1e6:,.1f} MB" in out
     found = contents(of_remote)
     expected = contents(of_local)
     assert_array_equal(found.points, expected.points)

@@ -68,6 +68,13 @@ def test_text_may_have_more_points_than_it_announces_but_not_fewer(tmp_path):
         contents(path)
 
 
+def test_text_comment_in_another_encoding_is_left_out(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_bytes("# Höhe in m\n1 2 3\n4 5 6\n".encode("latin-1"))
+
+    assert contents(path).points.tolist() == [[1, 2, 3], [4, 5, 6]]
+
+
 def test_obj_faces_after_tab_make_a_mesh(tmp_path):
     path = tmp_path / "a.obj"
     path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf\t1 2 3\n")
