@@ -1,4 +1,5 @@
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -146,12 +147,20 @@ def test_compare_file_samples_once_before_it_measures_time(tmp_path, monkeypatch
     assert sizes == [120, 700, 120, 700]
 
 
-def test_page_shows_the_input_and_the_last_method_with_z_upwards(tmp_path):
+MEASURES: dict[str, Any] = {
+    "chamfer": 0.0,
+    "hausdorff": 0.0,
+    "density": 0.0,
+    "ground": None,
+    "seconds": 0.0,
+}
+
+
+def test_page_shows_the_input_and_the_last_method_with_z_upwards():
     points = np.array([[5.0, 0.0, 0.0], [7.0, 0.0, 0.0], [6.0, 2.0, 0.0], [6.0, -2.0, 4.0]])
-    measures = {"chamfer": 0.0, "hausdorff": 0.0, "density": 0.0, "ground": None, "seconds": 0.0}
     results = [
-        compare.Result("fps", np.array([0, 3]), **measures),
-        compare.Result("trained", np.array([2, 1]), **measures),
+        compare.Result("fps", np.array([0, 3]), **MEASURES),
+        compare.Result("trained", np.array([2, 1]), **MEASURES),
     ]
     compared = compare.FileResult(Path("scans/room.ply"), points, 2, results)
 
@@ -168,9 +177,8 @@ def test_page_shows_the_input_and_the_last_method_with_z_upwards(tmp_path):
     assert clouds["hidden"] == ["fps"]
 
 
-def test_page_shows_a_cloud_of_one_place(tmp_path):
-    measures = {"chamfer": 0.0, "hausdorff": 0.0, "density": 0.0, "ground": None, "seconds": 0.0}
-    result = compare.Result("fps", np.array([0]), **measures)
+def test_page_shows_a_cloud_of_one_place():
+    result = compare.Result("fps", np.array([0]), **MEASURES)
     compared = compare.FileResult(Path("a.ply"), np.full((2, 3), 7.0), 1, [result])
 
     clouds = compare._clouds(compared)
