@@ -23,6 +23,11 @@ def values(name, points, output):
     return found[m]
 
 
+def generated(points):
+    """A set of points that were not chosen by their rows."""
+    return SampleOutput(points, None, {})
+
+
 @pytest.fixture
 def clouds(randn):
     return randn(3, 40, 3)
@@ -30,7 +35,7 @@ def clouds(randn):
 
 def test_subset_distance_matches_kd_tree(clouds, randn):
     samples = randn(3, 7, 3)
-    output = SampleOutput(samples, None, {})
+    output = generated(samples)
 
     found = values("generated/subset_distance", clouds, output)
 
@@ -46,18 +51,16 @@ def test_subset_distance_is_between_coordinates(clouds, randn):
     with_channels = torch.cat([clouds, 9 * randn(3, 40, 2)], 2)
     samples_with_channels = torch.cat([samples, 9 * randn(3, 7, 2)], 2)
 
-    found = values(
-        "generated/subset_distance", with_channels, SampleOutput(samples_with_channels, None, {})
-    )
+    found = values("generated/subset_distance", with_channels, generated(samples_with_channels))
 
-    expected = values("generated/subset_distance", clouds, SampleOutput(samples, None, {}))
+    expected = values("generated/subset_distance", clouds, generated(samples))
     assert_close(found, expected)
 
 
 def test_unique_points_counts_each_match_once(clouds):
     near = clouds[:, 9] + 1e-4
     samples = torch.stack([clouds[:, 4], clouds[:, 4], near], 1)
-    output = SampleOutput(samples, None, {})
+    output = generated(samples)
 
     numbers = values("matched/unique_points", clouds, output)
 
@@ -147,6 +150,6 @@ def test_set_metric_of_nan_is_nan():
 
 
 def test_matrix_metrics_without_matrix_are_none(clouds):
-    output = SampleOutput(clouds[:, :5], None, {})
+    output = generated(clouds[:, :5])
     assert values("matrix/nonzero_percent", clouds, output) is None
     assert values("matrix/orthogonality_error", clouds, output) is None

@@ -19,6 +19,19 @@ def moved(net):
     return net
 
 
+def two_stage_net(sampler):
+    """Return a net of three classes whose stages keep 12 and 6 points."""
+    return HierarchicalNet(3, sampler, points=(12, 6), channels=(8, 10, 12), k=4, hidden=8)
+
+
+def seven_channels(k, **settings):
+    """Return a stage that keeps 5 points and gathers k neighbours, and its sampler."""
+    sampler = StageMOPSNet(5, 7, tau_min=1.0, anchor_width=3.0, **settings)
+    net = moved(sampler).eval()
+    stage = Stage(net, 5, channels_in=7, channels_out=9, k=k)
+    return net, stage.eval()
+
+
 def farthest_order(points, number):
     """Return farthest points of clouds, from the point farthest from the mean."""
     centred = points - points.mean(1, keepdim=True)
@@ -135,9 +148,7 @@ def test_hierarchical_net_gives_its_stages_the_distances_to_the_nearest_points(r
 
 @pytest.mark.parametrize("k", [3, 6])
 def test_stage_gathers_the_points_nearest_to_the_anchors(k, randn):
-    sampler = StageMOPSNet(5, 7, tau_min=1.0, anchor_width=3.0, neighbours=6)
-    net = moved(sampler).eval()
-    stage = Stage(net, 5, channels_in=7, channels_out=9, k=k).eval()
+    net, stage = seven_channels(k, neighbours=6)
     points = randn(2, 60, 3)
     features = randn(2, 60, 7)
 
@@ -161,9 +172,7 @@ def test_stage_gathers_the_points_nearest_to_the_anchors(k, randn):
     ],
 )
 def test_stage_searches_neighbours_that_its_sampler_does_not_know(settings, randn):
-    sampler = StageMOPSNet(5, 7, tau_min=1.0, anchor_width=3.0, **settings)
-    net = moved(sampler).eval()
-    stage = Stage(net, 5, channels_in=7, channels_out=9, k=4).eval()
+    net, stage = seven_channels(4, **settings)
     points = randn(2, 60, 3)
     features = randn(2, 60, 7)
     output = net.by_features(points, features, 5)
@@ -176,7 +185,7 @@ def test_stage_searches_neighbours_that_its_sampler_does_not_know(settings, rand
 
 def test_hierarchical_net_trains_its_stages_through_the_host_features(randn):
     sampler = partial(StageMOPSNet, alpha=1.0, neighbours=4, overlap=0.1)
-    net = HierarchicalNet(3, sampler, points=(12, 6), channels=(8, 10, 12), k=4, hidden=8)
+    net = two_stage_net(sampler)
     points = randn(4, 40, 3)
 
     logits = net(points)
@@ -199,7 +208,7 @@ def test_hierarchical_net_trains_its_stages_through_the_host_features(randn):
 
 def test_stage_sampler_takes_clouds_with_fewer_points(randn):
     sampler = partial(StageMOPSNet, neighbours=4)
-    net = HierarchicalNet(3, sampler, points=(12, 6), channels=(8, 10, 12), k=4, hidden=8).eval()
+    net = two_stage_net(sampler).eval()
     points = randn(2, 5, 3)
 
     logits = net(points)
@@ -247,7 +256,7 @@ def test_stage_sampler_with_no_channels_is_refused(name):
 @pytest.mark.parametrize("sampler", [StageMOPSNet, partial(MOPSNet, anchors="fps")])
 def test_hierarchical_net_in_another_type_is_near_single_precision(sampler, dtype, randn):
     torch.manual_seed(0)
-    net = HierarchicalNet(3, sampler, points=(12, 6), channels=(8, 10, 12), k=4, hidden=8).eval()
+    net = two_stage_net(sampler).eval()
     points = randn(2, 40, 3)
     expected = net(points)
 
