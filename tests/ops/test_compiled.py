@@ -238,6 +238,28 @@ def test_compiled_forms_take_finite_points_only(k, rand):
     assert compiled.farthest(with_nan, indices, counts, 4) is None
 
 
+def test_weighted_farthest_in_threads_equals_torch_form(rand, both, monkeypatch):
+    monkeypatch.setattr(farthest, "THREADS_MIN_WORK", 1)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    points = rand(5, 300, 3)
+    weight = rand(5, 300) + 0.1
+
+    fast, plain = both(farthest_point_sample, points, 100, 0, weight)
+
+    assert torch.equal(fast, plain)
+
+
+def test_nearest_in_threads_equals_torch_form(rand, both, monkeypatch):
+    monkeypatch.setattr(compiled, "THREADS_MIN_WORK", 1)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    points = rand(5, 300, 3)
+    queries = rand(5, 20, 3)
+
+    fast, plain = both(nearest_points, queries, points)
+
+    assert torch.equal(fast[1], plain[1])
+
+
 def test_neighbours_in_threads_take_finite_points_only(rand, monkeypatch):
     monkeypatch.setattr(compiled, "THREADS_MIN_WORK", 1)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)

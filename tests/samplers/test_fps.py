@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from mops_lightning.errors import UserError
-from mops_lightning.ops import compiled
+from mops_lightning.ops import compiled, farthest
 from mops_lightning.ops.fps import farthest_point_sample
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.ordering import point_hashes, seeded_order
@@ -90,8 +90,8 @@ def test_fps_sampler_farthest_start_equals_plain_form(randn):
     indices = FPSSampler(12, start="farthest")(points).indices
 
     centred = points - points.mean(1, keepdim=True)
-    farthest = centred.norm(dim=2).argmax(1)
-    assert indices.tolist() == plain_rows(points, farthest.tolist(), 12)
+    first = centred.norm(dim=2).argmax(1)
+    assert indices.tolist() == plain_rows(points, first.tolist(), 12)
 
 
 def test_fps_sampler_farthest_start_moves_with_the_cloud(rng, randn):
@@ -105,3 +105,27 @@ def test_fps_sampler_farthest_start_moves_with_the_cloud(rng, randn):
     indices_of_moved = sampler(moved).indices
 
     assert torch.equal(order[indices_of_moved], indices)
+
+
+def test_fps_sampler_with_weights_chooses_alike_on_every_device(rng, rand, monkeypatch):
+    points = torch.randint(0, 4, (3, 60, 3), generator=rng).float()  # ties and copies
+    weight = rand(3, 60) + 0.1
+    weight[:, ::2] = 1.0
+    sampler = FPSSampler(40, seed=3)
+
+    rows = sampler.sample_weighted(points, 40, weight)
+
+    monkeypatch.setattr(compiled, "farthest_from_start", lambda *_: None)
+    monkeypatch.setattr(compiled, "farthest", lambda *_: None)
+    assert torch.equal(sampler.sample_weighted(points, 40, weight), rows)
+
+
+def test_fps_sampler_in_threads_chooses_the_same_rows(rand, monkeypatch):
+    points = rand(5, 200, 3)
+    sampler = FPSSampler(30, seed=3)
+    rows = sampler(points).indices
+
+    monkeypatch.setattr(farthest, "THREADS_MIN_WORK", 1)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+
+    assert torch.equal(sampler(points).indices, rows)

@@ -4,6 +4,7 @@ from torch.testing import assert_close
 
 from mops_lightning import FMOPSNet, MOPSNet, SNet
 from mops_lightning.errors import UserError
+from mops_lightning.samplers import fused
 from mops_lightning.samplers.base import stream_sample
 
 
@@ -29,6 +30,18 @@ def test_stream_sample_of_a_sampler_in_training_mode_is_that_of_evaluation(randn
     in_evaluation = stream_sample(sampler.eval(), lambda: chunks)
 
     assert torch.equal(in_training, in_evaluation)
+
+
+def test_stream_sample_of_chunks_in_parts_equals_whole_cloud(trained, randn, monkeypatch):
+    monkeypatch.setattr(fused, "PART", 700)  # the last part has 200 points
+    cloud = randn(3000, 3)
+    cloud[2999] = torch.tensor([9.0, -9.0, 9.0])  # its features are among the largest
+    with torch.no_grad():
+        (whole,) = trained(cloud[None]).points
+
+    streamed = stream_sample(trained, lambda: cloud.split(1600))
+
+    assert_close(streamed, whole, rtol=0, atol=1e-5)
 
 
 def test_stream_sample_is_nested(randn):

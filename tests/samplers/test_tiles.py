@@ -10,6 +10,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from mops_lightning.errors import UserError
+from mops_lightning.samplers import tiles
 from mops_lightning.samplers.fmops import FMOPSNet
 from mops_lightning.samplers.fps import FPSSampler
 from mops_lightning.samplers.random import RandomSampler
@@ -248,6 +249,15 @@ def test_sample_by_tiles_gives_every_tile_its_own_channels():
     assert len(sampler.tiles) == 4
     for tile in sampler.tiles:
         assert torch.equal(tile[:, 3:], tile[:, :2] / 1000)
+
+
+def test_sample_by_tiles_in_several_batches_keeps_the_same_rows(sampler, monkeypatch):
+    points = street(1000)
+    together = sample_by_tiles(points, 100, 200, sampler)
+
+    monkeypatch.setattr(tiles, "BATCH", 300)
+
+    assert sample_by_tiles(points, 100, 200, sampler).tolist() == together.tolist()
 
 
 def test_sample_by_tiles_all_points_and_too_many(sampler):
