@@ -3,7 +3,9 @@
 import pytest
 import torch
 
-from mops_lightning.ops.maxima import max_of_points
+from mops_lightning.ops import compiled
+from mops_lightning.ops.maxima import max_of_points, max_of_rows
+from mops_lightning.ops.points import gather_points
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
@@ -47,3 +49,18 @@ def test_max_of_points_on_a_cpu_ignores_the_default_device():
         torch.set_default_device(None)
 
     assert largest.tolist() == [[2.0]]
+
+
+def test_max_of_rows_without_compiled_loops_is_that_of_gathered_rows(rng, randn, monkeypatch):
+    monkeypatch.setattr(compiled, "winners", lambda *_: None)
+    features = randn(3, 20, 6, requires_grad=True)
+    rows = torch.randint(20, (3, 9, 4), generator=rng)
+
+    maxima = max_of_rows(features, rows)
+
+    expected = gather_points(features, rows).amax(2)
+    assert maxima.equal(expected)
+    direction = randn(maxima.shape)
+    (gradient,) = torch.autograd.grad(maxima, features, direction)
+    (expected_gradient,) = torch.autograd.grad(expected, features, direction)
+    torch.testing.assert_close(gradient, expected_gradient)

@@ -3,6 +3,7 @@ import torch
 from torch.testing import assert_close
 
 from mops_lightning.ops import attention, sampling_matrix
+from mops_lightning.ops.local_matrix import LocalMatrix
 from mops_lightning.ops.sampling_matrix import SamplingMatrix
 
 
@@ -148,6 +149,18 @@ def test_sparse_drops_and_renormalises(path, threshold):
     sparse = matrix.sparse(threshold)
 
     assert_close(sparse.to_dense(), expected)
+
+
+def test_entries_count_from_a_hundredth_unless_another_threshold_is_given():
+    shares = torch.tensor([0.008, 0.012, 0.98])
+    full = SamplingMatrix(shares.log()[None], torch.eye(3)[None], 1.0)
+    local = LocalMatrix(shares.view(1, 1, 3), torch.tensor([[[0, 1, 2]]]), 3)
+
+    for matrix in (full, local):
+        assert matrix.nonzero_counts().tolist() == [[2.0]]
+        large, small = (0.98 / 0.992, 0.012 / 0.992)
+        (sparse,) = matrix.sparse().to_dense()
+        assert sparse[:, 0].tolist() == pytest.approx([0, small, large])
 
 
 def test_nonzero_counts_and_gram_equal_dense(path):
