@@ -1,5 +1,6 @@
 """The files of sweeps, also of the rivals: each composes, and names every cell apart."""
 
+import json
 import pickle
 from functools import cache
 from pathlib import Path
@@ -13,6 +14,8 @@ from omegaconf import OmegaConf
 
 import mops_lightning.config.compose  # noqa: F401  registers the resolvers
 from hydra_plugins.grid_sweeper import parsed
+from mops_lightning.config import settings
+from mops_lightning.config.declaration import Affects
 from mops_lightning.config.groups import conf_dir, sweeps_dir
 from mops_lightning.config.validate import check
 from mops_lightning.tree import dotted
@@ -173,3 +176,75 @@ def settings_of(name, overrides):
     cfg = composed(name, overrides)
     plain = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"])
     return dotted(OmegaConf.to_container(plain, resolve=True))
+
+
+COMMITTED = {
+    "ablation": "ablation_shapes",
+    "ablation_airplanes": "ablation",
+    "classification_joint": "classification_joint",
+    "classification_joint_dgcnn": "classification_joint/dgcnn",
+    "las_segmentation": "las_segmentation",
+    "modelnet40": "modelnet40",
+    "modelnet40_trials": "modelnet40_nets/trials",
+    "registration": "registration/sweep",
+    "scans_of_shapes": "scans_of_shapes",
+    "segmentation": "segmentation",
+    "transfer": "transfer/modelnet40",
+}
+"""Sweeps, and the folders in results/ with the records of their cells."""
+
+OF_THE_PLACE = ("dataset.root", "trainer.precision", "weights", "other_nets", "recipe.warm_start")
+"""Settings that were given on the command line, or name files of a sweep's folder."""
+
+
+def committed_settings(name):
+    """Return the settings of a sweep's committed cells, by their folders in the sweep."""
+    path = CHECKOUT / "results" / COMMITTED[name] / "runs.jsonl"
+    cells = {}
+    for line in path.read_text().splitlines():
+        record = json.loads(line)
+        folder = record["folder"].rpartition("/")[2]
+        cells[folder] = dotted(record["config"])
+    return cells
+
+
+def first_cells(name):
+    """Return the overrides of the first cell of every grid."""
+    cells = []
+    for grid in grids(composed(name)):
+        first = {override.get_key_element(): texts(override)[0] for override in grid}
+        cells.append(written_out(first))
+    return cells
+
+
+def all_cells(name):
+    """Return the overrides of every cell."""
+    cells = []
+    for grid in grids(composed(name)):
+        (of_grid,) = BasicSweeper.split_arguments(grid, None)
+        cells += [tuple(cell) for cell in of_grid]
+    return cells
+
+
+@pytest.mark.parametrize("name", COMMITTED)
+def test_cells_of_a_sweep_have_the_settings_of_their_committed_records(name):
+    """What a result is affected by, of those settings that both versions of the program have."""
+    committed = committed_settings(name)
+    cells = first_cells(name)
+    if name in CELLS:
+        cells = all_cells(name)
+
+    found = 0
+    for cell in cells:
+        cfg = composed(name, cell)
+        recorded = committed.get(cfg.hydra.sweep.subdir)
+        if recorded is None:
+            continue
+        found += 1
+        present = settings_of(name, cell)
+        for path in present.keys() & recorded.keys():
+            affects = settings.of(path).affects is not Affects.NOTHING
+            if affects and path not in OF_THE_PLACE:
+                assert present[path] == recorded[path], (cell, path)
+
+    assert found >= 2
