@@ -111,7 +111,6 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     "task=registration optimizer=exponential": {
         "optimizer.lr": 0.0001,
-        "optimizer.schedule.end_lr": 1e-05,
     },
     "optimizer=step_decay": {
         "optimizer._target_": "torch.optim.Adam",
@@ -294,9 +293,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         "trainer.profiler": "simple",
         "epochs.task": 1,
         "epochs.sampler": 1,
-    },
-    "logger=csv": {
-        "logger._target_": "lightning.pytorch.loggers.CSVLogger",
     },
     "logger=mlflow": {
         "logger.experiment_name": "mops_lightning",
