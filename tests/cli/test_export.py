@@ -1,3 +1,5 @@
+import re
+
 import pytest
 import torch
 
@@ -13,7 +15,10 @@ def test_export_of_a_model_writes_a_file_that_runs_at_any_size(tmp_path):
     model = "fmops.modelnet40-m512"
     status, out, err = captured(export, [model, target, "--m", 10], command)
     assert (status, err) == (0, "")
-    assert out.startswith(f"{target}: ")
+    said = rf"{target}: (.+) MB; largest difference from the sampler \d\.\de-\d\d\n"
+    printed = re.fullmatch(said, out)
+    assert printed is not None
+    assert printed[1] == f"{target.stat().st_size / 1e6:.2f}"
     net, sampler = torch.export.load(target).module(), load(model)
     with torch.no_grad():
         for shape in ((1, 12), (4, 100), (2, 257)):
@@ -46,3 +51,13 @@ def test_export_on_a_full_disk_is_one_line(tmp_path):
         err = refused(export, ["mops.modelnet40-m32", target], "mops-lightning export")
     assert f"{target}: File too large. Free some space" in err
     assert not list(tmp_path.iterdir())
+
+
+def test_export_replaces_a_file_on_request(tmp_path):
+    target = tmp_path / "net.pt2"
+    target.write_text("old")
+
+    status, out, err = captured(export, ["snet.modelnet40-m32", target, "--overwrite"], "export")
+
+    assert (status, err) == (0, "")
+    assert target.read_bytes()[:2] == b"PK"

@@ -3,7 +3,7 @@ import os
 import pytest
 
 from mops_lightning.cli.models import main
-from mops_lightning.zoo import model_file, names
+from mops_lightning.zoo import model_file, names, publish
 from tests.support.captured import captured, done, refused
 from tests.support.full_disk import full_disk
 from tests.support.models import rewrite, write_run
@@ -154,3 +154,68 @@ def test_models_says_that_the_code_of_a_run_was_changed(tmp_path):
 
     shown = dict(line.split(maxsplit=1) for line in card.splitlines())
     assert shown["commit"] == "0123abc (changed)"
+
+
+def test_models_shows_every_fact_of_a_card(tmp_path):
+    folder = tmp_path / "run"
+    git = {"commit": "0123abc", "dirty": False}
+    write_run(folder, git=git, seed=7, overrides=["m=8", "sampler=fmops"])
+    done(main, ["add", folder, "fmops.mine", "--folder", tmp_path], COMMAND)
+    path = tmp_path / "fmops.mine.safetensors"
+    size = f"{path.stat().st_size / 1e6:.2f} MB"
+
+    out = done(main, [path], COMMAND)
+
+    assert [line.split(maxsplit=1) for line in out.splitlines()] == [
+        ["name", "fmops.mine"],
+        ["net", "fmops (sampler)"],
+        ["task", "classification by pointnet"],
+        ["sizes", "1-16"],
+        ["input", "clouds in the unit sphere (centroid at the origin, largest distance from it 1)"],
+        ["test", "figures  accuracy (%), m=8: 50.00 generated"],
+        ["data", "shapes, 64 points per cloud in training"],
+        ["recipe", "m=8 sampler=fmops"],
+        ["epochs", "3"],
+        ["seed", "7"],
+        ["commit", "0123abc"],
+        ["licence", "MIT"],
+        ["file", f"{path}, {size}"],
+        ["sha256", f"{model_file.read_card(path)['sha256']} (of the tensors)"],
+    ]
+
+
+def test_models_shows_channels_classes_and_precision(tmp_path):
+    write_run(tmp_path / "run")
+    path = publish.add(tmp_path / "run", "fmops.mine", tmp_path, half=True)
+    record = model_file.read_card(path)["record"]
+    record["config"] |= {"learn": "task", "dataset": {"classes": ["chair", "vase"]}}
+    channels = [["intensity", 0.0, 1.0], ["time", 0.0, 1.0]]
+    rewrite(path, classes=["chair", "vase"], channels=channels, record=record)
+
+    shown = {}
+    for line in done(main, [path], COMMAND).splitlines():
+        key, _, text = line.partition("  ")
+        shown[key] = text.strip()
+
+    assert shown["net"] == "pointnet (task net)"
+    assert shown["channels"] == "intensity, time"
+    assert shown["classes"] == "chair, vase"
+    assert shown["data"] == "shapes (chair, vase)"
+    assert shown["recipe"] == "m=32"
+    assert shown["file"].endswith(" MB, wide layers in float16")
+    assert "sizes" not in shown
+
+
+def test_models_says_where_a_model_is_found(tmp_path, monkeypatch):
+    write_run(tmp_path / "run")
+    monkeypatch.setenv(names.VARIABLE, str(tmp_path))
+
+    out = done(main, ["add", tmp_path / "run", "fmops.mine"], COMMAND)
+
+    path = tmp_path / "fmops.mine.safetensors"
+    sha256 = model_file.read_card(path)["sha256"]
+    assert out.splitlines()[:2] == [
+        f"{path}: {path.stat().st_size / 1e6:.2f} MB",
+        f"Records name it fmops.mine@sha256:{sha256}.",
+    ]
+    assert "To find it by name" not in out

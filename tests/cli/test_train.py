@@ -53,6 +53,53 @@ def test_main_job_writes_complete_record(main_job):
     assert record.test_clouds == 3 * len(record.config["dataset"]["classes"])
 
 
+def test_main_job_records_its_data_nets_and_files(main_job):
+    folder, run, *_ = main_job
+    record = run_record.read(run)
+    (cached,) = (folder / "cache" / "weights").rglob("weights.safetensors")
+    net = weights.read(cached)
+
+    assert record.score_name == "test/generated/accuracy"
+    assert (record.train_clouds, record.test_clouds) == (12, 9)
+    assert record.class_names == ["chair", "lamp", "vase"]
+    assert record.part_names == []
+    assert record.dataset_fingerprint
+    assert record.weights_loaded == record.task_weights_sha256 == net["sha256"]
+    assert record.files == {
+        "checkpoint": "checkpoints/last.ckpt",
+        "clouds": "pictures/clouds.npz",
+        "pictures": "pictures",
+        "task_weights": "task_weights.safetensors",
+        "weights": "weights.safetensors",
+    }
+    assert record.parameters == {"task": 808003, "sampler": 331584}
+    assert record.processes == 1
+    assert record.warm_start == {"layers": 4}
+    assert record.recipe is not None
+    assert (record.recipe["name"], record.recipe["train_points"]) == ("fast", 256)
+    assert record.recipe["task_points"] is None  # of the training before
+    assert set(record.seconds) == {"data", "pretrain", "fit", "fit_cpu", "test", "total"}
+    assert record.validation
+    assert all(name.startswith("val/") for name in record.validation)
+    assert (record.partial, record.lengthened, record.resumed_from) == ([], False, None)
+    assert set(record.versions) == {"python", *run_record.PACKAGES}
+    assert record.collapsed == {"8": record.metrics["test/matched/unique_points"]}
+
+
+def test_main_job_writes_its_settings_figures_and_classes_beside_the_weights(main_job):
+    _, run, *_ = main_job
+    record = run_record.read(run)
+
+    classes = {}
+    for name in ("weights", "task_weights"):
+        content = weights.read(run / f"{name}.safetensors")
+        assert content["config"] == record.config
+        assert content["metrics"] == record.metrics
+        classes[name] = content["classes"]
+
+    assert classes == {"weights": [], "task_weights": ["chair", "lamp", "vase"]}
+
+
 def test_main_job_writes_weights_pictures_and_curves(main_job):
     folder, run, *_ = main_job
     content = weights.read(run / "weights.safetensors")

@@ -7,7 +7,14 @@ import torch
 from safetensors.torch import load_file
 
 from mops_lightning.config.compose import compose
-from mops_lightning.config.distributed import check_shares, check_start
+from mops_lightning.config.distributed import (
+    check_multirun,
+    check_shares,
+    check_start,
+    is_distributed,
+    is_worker_rank,
+    started_together,
+)
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from tests.support.command_line import SMALL_PCRNET, TINY, call, call_anew, done
@@ -105,3 +112,45 @@ def test_evaluation_by_two_processes_equals_that_by_one(tmp_path):
     assert tested.status == "completed"
     assert tested.processes == 2
     assert tested.metrics == pytest.approx(trained.metrics, rel=1e-5, abs=1e-6)
+
+
+RANKS = ["RANK", "LOCAL_RANK", "NODE_RANK", "GROUP_RANK", "SLURM_PROCID"]
+
+
+@pytest.mark.parametrize("name", RANKS)
+def test_worker_rank_is_told_by_every_launcher(name, monkeypatch):
+    several = compose(["trainer=ddp", "trainer.devices=2"])
+    one = compose(["trainer=cpu"])
+
+    assert not is_worker_rank(several)
+    monkeypatch.setenv(name, "0")
+    assert not is_worker_rank(several)
+    monkeypatch.setenv(name, "1")
+    assert is_worker_rank(several)
+    assert not is_worker_rank(one)
+
+
+@pytest.mark.parametrize(
+    ("devices", "several"),
+    [("1", False), ("[0]", False), ("[3]", False), ("2", True), ("[0,1]", True), ("auto", True)],
+)
+def test_several_devices_may_be_a_number_a_list_or_auto(devices, several):
+    cfg = compose([f"trainer.devices={devices}"])
+
+    assert is_distributed(cfg) == several
+    if several:
+        with pytest.raises(UserError, match=r"trainer\.devices must be 1 in a sweep \(-m\)"):
+            check_multirun(cfg)
+    else:
+        check_multirun(cfg)
+
+
+@pytest.mark.parametrize("name", ["WORLD_SIZE", "SLURM_NTASKS"])
+def test_processes_of_a_launcher_are_known_by_their_number(name, monkeypatch):
+    several = compose(["trainer=ddp", "trainer.devices=2"])
+
+    monkeypatch.setenv(name, "1")
+    assert not started_together(several)
+    monkeypatch.setenv(name, "2")
+    assert started_together(several)
+    assert not started_together(compose(["trainer=cpu"]))

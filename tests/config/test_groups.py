@@ -286,3 +286,19 @@ def test_own_scans_needs_a_folder_and_gives_a_sampler_for_tiles(files, tmp_path)
     status, out, err = call(["downsample", *arguments], tmp_path)
     assert (status, err) == (0, "")
     assert len(np.unique(np.load(tmp_path / "small.npy"), axis=0)) == 70
+
+
+@pytest.mark.parametrize(
+    ("chosen", "label"),
+    [
+        ("sampler=mops sampler.anchors=fps", "mops-anchored-m32"),
+        ("sampler=mops sampler.anchors=fps learn=joint", "mops-anchored-m32-joint"),
+        ("sampler=fps m=7", "fps-m7"),
+        ("sampler=fps evaluate=run", "fps-evaluated"),
+        ("learn=task evaluate=run task/net=dgcnn", "dgcnn"),
+    ],
+)
+def test_run_label_says_what_distinguishes_runs(chosen, label):
+    cfg = compose([*chosen.split(), "+logger.name2=${run_label:}"])
+
+    assert cfg.logger.name2 == label

@@ -7,7 +7,7 @@ import torch
 from mops_lightning import FMOPSNet, FPSSampler, MOPSNet, SampleNet, SNet, load
 from mops_lightning.channels import Channel, PointChannels
 from mops_lightning.errors import UserError
-from mops_lightning.zoo.export import export
+from mops_lightning.zoo.export import GeneratedPoints, export
 
 SMALL: dict[str, Any] = {"feature_channels": (8, 8), "rho_channels": (16, 8)}
 SMALL_SNET: dict[str, Any] = {"feature_channels": (8, 8), "head_channels": (8,)}
@@ -188,3 +188,34 @@ def test_exported_program_takes_channels(sampler, width, tmp_path):
         expected = sampler(points).points[..., :width]
         assert generated.shape == (2, 8, width)
         assert torch.allclose(generated, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("suffix", [".pt2", ".onnx"])
+def test_program_that_differs_from_its_sampler_is_not_written(suffix, tmp_path, monkeypatch):
+    if suffix == ".onnx":
+        pytest.importorskip("onnxscript", reason="extra onnx")
+    sampler = MOPSNet(8, **SMALL).eval()
+    right = GeneratedPoints.forward
+    monkeypatch.setattr(GeneratedPoints, "forward", lambda self, points: right(self, points) + 0.01)
+
+    said = r"points differ from the sampler's by up to 1\.0e-02, more than 1e-05; nothing was"
+    with pytest.raises(UserError, match=said):
+        export(sampler, tmp_path / f"net{suffix}")
+
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_program_is_compared_at_many_points_and_several_clouds(tmp_path, monkeypatch):
+    sampler = MOPSNet(8, **SMALL).eval()
+    seen = []
+    forward = MOPSNet.forward
+
+    def note(self, points, m=None):
+        seen.append(tuple(points.shape))
+        return forward(self, points, m)
+
+    monkeypatch.setattr(MOPSNet, "forward", note)
+
+    export(sampler, tmp_path / "net.pt2")
+
+    assert seen == [(1, 13, 3), (3, 21, 3), (2, 61, 3), (1, 65536, 3)]

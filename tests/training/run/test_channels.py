@@ -17,8 +17,9 @@ from mops_lightning.data.formats.table import Table
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.training.experiment import Experiment
-from mops_lightning.training.run.channels import check_sampler
+from mops_lightning.training.run.channels import check_sampler, scaled_as_trained
 from mops_lightning.training.run.make_experiment import make_experiment
+from mops_lightning.zoo import weights
 from mops_lightning.zoo.publish import add
 from tests.support import downsample
 from tests.support.command_line import TINY_ANY_DATA, done, refused, runs
@@ -265,3 +266,56 @@ def test_real_airborne_scans_train_and_are_downsampled_with_intensity(real_data,
     assert after["intensity"].max() <= before["intensity"].max()
     normals = np.stack([after[name] for name in ("nx", "ny", "nz")], axis=1)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), np.ones(8), atol=1e-5)
+
+
+def net_with_channels(folder, *columns):
+    """Write the weights of a task net that was trained with channels, and return their file."""
+    folder.mkdir()
+    path = folder / weights.FILE
+    channels = PointChannels(columns)
+    weights.save(path, torch.nn.Linear(1, 1), {"learn": "task"}, {}, channels=channels)
+    return path
+
+
+@pytest.fixture
+def data(with_intensity):
+    """The same with other statistics."""
+    return replace(with_intensity, channels=PointChannels([Channel("intensity", 10.0, 2.0)]))
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "weights={}",
+        "other_nets=[{}]",
+        "recipe.warm_start={}",
+        "pretrain_from={}",
+    ],
+)
+def test_channels_are_scaled_as_a_given_net_was_trained(setting, data, tmp_path):
+    path = net_with_channels(tmp_path / "net", Channel("intensity", 20.0, 4.0))
+
+    scaled = scaled_as_trained(data, compose([setting.format(path)]), None)
+
+    assert scaled.channels == PointChannels([Channel("intensity", 20.0, 4.0)])
+    of_files = data.train.points[..., 3] * 2 + 10
+    torch.testing.assert_close(scaled.train.points[..., 3], (of_files - 20) / 4)
+    assert torch.equal(scaled.train.points[..., :3], data.train.points[..., :3])
+
+
+def test_start_of_a_training_that_is_not_needed_scales_no_channel(data, tmp_path):
+    path = net_with_channels(tmp_path / "net", Channel("intensity", 20.0, 4.0))
+
+    cfg = compose([f"pretrain_from={path}", "weights=null"])
+
+    assert scaled_as_trained(data, cfg, None) is data
+
+
+def test_given_nets_of_other_statistics_are_refused(data, tmp_path):
+    first = net_with_channels(tmp_path / "first", Channel("intensity", 20.0, 4.0))
+    second = net_with_channels(tmp_path / "second", Channel("intensity", 20.0, 5.0))
+    same = net_with_channels(tmp_path / "same", Channel("intensity", 20.0, 4.0))
+
+    scaled_as_trained(data, compose([f"weights={first}", f"other_nets=[{same}]"]), None)
+    with pytest.raises(UserError, match=r"^other_nets: .*second.* with other statistics of the"):
+        scaled_as_trained(data, compose([f"weights={first}", f"other_nets=[{second}]"]), None)

@@ -83,3 +83,21 @@ def test_completed_run_resumed_is_completed_with_the_cpu_time_of_all_parts(tmp_p
     assert again.partial == []
     assert again.metrics == first.metrics
     assert again.seconds["fit_cpu"] > 1000
+
+
+@pytest.mark.parametrize(
+    ("limits", "partial"),
+    [
+        ([], []),
+        (["+trainer.max_steps=3"], ["trained for 3 of 4 steps"]),
+    ],
+)
+def test_steps_of_accumulated_gradients_are_counted_with_the_last_of_an_epoch(
+    limits, partial, tmp_path
+):
+    """Of three batches, two and one make a step."""
+    accumulated = ["+trainer.accumulate_grad_batches=2", "val_fraction=0", "trainer.max_epochs=2"]
+
+    record = job(tmp_path / "run", "weights=null", "recipe=paper", *accumulated, *limits)
+
+    assert record.partial == partial
