@@ -75,6 +75,10 @@ def test_loader_augments_anew_in_every_batch_and_epoch():
     first_batch = noise[:4]
     second_batch = noise[4:8]
     assert not torch.allclose(first_batch, second_batch, atol=1e-4)
+    of_seed = points_of(CloudLoader(clouds(), 4, augment=augment, seed=1))
+    of_other_seed = points_of(CloudLoader(clouds(), 4, augment=augment, seed=2))
+    assert torch.equal(of_seed, first)
+    assert (of_other_seed != first).any(2).all()
 
 
 def test_augmentation_jitter_is_clipped(rng, monkeypatch):
