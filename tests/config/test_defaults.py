@@ -72,6 +72,58 @@ def test_values_of_a_group_are_the_defaults_of_its_class(file):
     assert different == DIFFERENT.get(file, set())
 
 
+WHOLE = {"test_frames": None, "crop": "whole", "crops": 1}
+SURFACE = {"test_frames": None, "crop": "surface", "crops": 1}
+
+DATA_SETS: dict[str, dict[str, Any]] = {
+    "clouds": {
+        "root": "???",
+        "test_frames": None,
+        "crop": "nearest",
+        "crops": None,
+        "seed": "${seed}",
+        "cache": "${cache}/meshes",
+    },
+    "hdf5": {"root": "???"},
+    "mesh_sequence": {
+        "root": "???",
+        "n_points": 40960,
+        **SURFACE,
+        "test_frames": "last",
+        "gap": 2,
+        "seed": "${seed}",
+        "cache": "${cache}/meshes",
+    },
+    "meshes": {"root": "???", **SURFACE, "seed": "${seed}", "cache": "${cache}/meshes"},
+    "modelnet40": {"root": "data/modelnet40_ply_hdf5_2048"},
+    "scans_of_shapes": {"seed": "${seed}", "cache": "${cache}/shapes"},
+    "shapenet_core": {
+        "root": "data/shape_net_core_uniform_samples_2048",
+        **WHOLE,
+        "test_share": 0.15,
+        "cache": "${cache}/meshes",
+    },
+    "shapes": {"seed": "${seed}", "cache": "${cache}/shapes"},
+}
+"""Values of data sets that are no defaults of their functions, as the files have them."""
+
+
+@pytest.mark.parametrize("name", DATA_SETS)
+def test_data_set_has_the_values_of_its_kind(name):
+    content: Any = OmegaConf.to_container(FILES[f"dataset/{name}.yaml"])
+    defaults = defaults_of(hydra.utils.get_object(content.pop("_target_")))
+
+    others = {}
+    for key, value in content.items():
+        if key not in defaults or value != defaults[key]:
+            others[key] = value
+
+    assert others == DATA_SETS[name]
+    assert {f"dataset/{kind}.yaml" for kind in DATA_SETS} == {
+        file for file in FILES if file.startswith("dataset/")
+    }
+
+
 @pytest.mark.parametrize(
     ("dataset", "seed"),
     [

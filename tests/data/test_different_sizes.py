@@ -156,6 +156,37 @@ def test_loader_with_shuffle_puts_clouds_of_similar_sizes_together():
         assert of_batch.max() - of_batch.min() == 4
 
 
+def test_loader_sorts_the_clouds_of_eight_batches_by_size():
+    sizes = torch.randperm(80, generator=generator(1)) + 10
+    clouds = Clouds(torch.rand(80, 89, 3), torch.zeros(80, dtype=torch.long), sizes=sizes)
+
+    batches = list(CloudLoader(clouds, 5, shuffle=True, seed=3))
+
+    drawn = torch.randperm(80, generator=generator(3, 0))
+    first = torch.cat([batch.rows for batch in batches[:8]])
+    second = torch.cat([batch.rows for batch in batches[8:]])
+    assert first.tolist() == sorted(drawn[:40].tolist(), key=lambda row: sizes[row])
+    assert second.tolist() == sorted(drawn[40:].tolist(), key=lambda row: sizes[row])
+
+
+def test_loader_batch_of_chosen_clouds_has_points_of_each_with_their_parts():
+    points = torch.rand(3, 60, 3)
+    parts = torch.arange(180).view(3, 60)
+    sizes = torch.tensor([60, 40, 55])
+    clouds = Clouds(points, torch.tensor([4, 5, 6]), parts=parts, sizes=sizes)
+    rows = torch.tensor([2, 1])
+
+    batch = CloudLoader(clouds, 4, seed=5).batch_of(rows)
+
+    drawn = torch.rand(2, 60, generator=generator(14, 5))
+    for number, row in enumerate(rows.tolist()):
+        kept = drawn[number, : sizes[row]].argsort()[:40].sort().values
+        assert torch.equal(batch.points[number], points[row][kept])
+        assert torch.equal(batch.parts[number], parts[row][kept])
+    assert batch.labels.tolist() == [6, 5]
+    assert torch.equal(batch.rows, rows)
+
+
 def test_loader_points_depend_on_epoch_and_continue_after_a_stop(folder):
     clouds = dataset_of(folder).train
     loader = CloudLoader(clouds, 2, shuffle=True)
