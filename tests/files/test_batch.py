@@ -3,8 +3,10 @@
 import os
 
 import numpy as np
+import pytest
 
 from mops_lightning.files import batch
+from mops_lightning.files.options import Options
 from tests.support.clouds import uniform_points
 from tests.support.downsample import call, done
 
@@ -59,3 +61,17 @@ def test_dead_worker_is_reported_and_second_run_completes(folder, tmp_path, monk
 
 def die(*_):
     os._exit(9)
+
+
+@pytest.mark.parametrize(("workers", "threads"), [(1, 8), (3, 2), (8, 1), (99, 1)])
+def test_workers_share_the_cores_of_the_machine(workers, threads, tmp_path, monkeypatch):
+    chosen = []
+    monkeypatch.setattr(os, "cpu_count", lambda: 8)
+    monkeypatch.setattr("torch.set_num_threads", chosen.append)
+    np.save(tmp_path / "a.npy", uniform_points(20, 0))
+    options = Options(5, method="random")
+
+    batch.attempt(tmp_path / "a.npy", tmp_path / "b.npy", options, workers)
+    batch.attempt(tmp_path / "a.npy", tmp_path / "c.npy", options)
+
+    assert chosen == [threads]

@@ -144,3 +144,15 @@ def test_sampler_with_anchors_takes_whole_files_only(anchored, tmp_path):
     kept = np.load(out)
     assert kept.shape == (20, 3)
     assert "anchors=fps" in words
+
+
+@pytest.mark.parametrize("readout", ["generated", "matched"])
+def test_equal_points_in_chunks_give_this_point(readout, folder, tmp_path):
+    source = tmp_path / "a.npy"
+    out = tmp_path / "b.npy"
+    np.save(source, np.full((90, 3), 7.0))
+    settings = ["--weights", folder, "--readout", readout, "--m", 20]
+
+    done(source, out, *settings, "--chunk", 40)
+
+    assert_allclose(np.load(out), np.full((20, 3), 7.0), atol=1e-6)

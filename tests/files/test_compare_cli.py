@@ -3,6 +3,7 @@ import re
 
 import numpy as np
 import pytest
+import trimesh
 
 from mops_lightning.files.cli import compare as main
 from mops_lightning.samplers.fmops import FMOPSNet
@@ -94,6 +95,20 @@ def test_compare_keeps_an_earlier_comparison(folder, tmp_path):
     assert table.read_text() == earlier
 
 
+@pytest.mark.parametrize("method", ["random", "fps"])
+def test_compare_takes_points_of_a_mesh_and_of_methods_by_the_seed(method, tmp_path):
+    mesh = tmp_path / "box.off"
+    trimesh.creation.box().export(mesh)
+    found = []
+    for number, seed in enumerate((3, 3, 4)):
+        out = tmp_path / str(number)
+        done(main, [mesh, "--m", 9, "--methods", method, "--seed", seed, "--out", out])
+        found.append(distances_of_first_row((out / "table.csv").read_text()))
+
+    assert found[0] == found[1]
+    assert found[0] != found[2]
+
+
 def test_compare_page_opens_without_errors(folder, tmp_path, opened):
     path = tmp_path / "compare.html"
     call(folder / "one.ply", "--m", 30, "--methods", "random", "--out", tmp_path)
@@ -113,6 +128,9 @@ def test_compare_page_opens_without_errors(folder, tmp_path, opened):
         (["--m", 5, "--tile", 64], "give --weights"),
         (["--m", 5, "--methods", "fsp"], "--methods: unknown 'fsp'.*'fps'"),
         (["--m", 5, "--columns", "x,y,z"], "--columns is for .bin files"),
+        (["--m", 5, "--max-distance", 1], "--max-distance is for --task icp"),
+        (["--m", 5, "--sample-target"], "--sample-target is for --task icp"),
+        (["--m", 5, "--seed", 2**63], "--seed must be from 0"),
         (["--m", 0], "--m must be"),
         (["--m", 701], "fewer than --m 701"),
         (["--m", 60, "--weights", "FOLDER"], "trained for up to 32 points, got 60"),

@@ -10,8 +10,9 @@ from scipy.spatial import cKDTree
 import mops_lightning
 from mops_lightning.files import propagate as module
 from mops_lightning.files.cli import propagate as main
+from mops_lightning.filesystem import TEMPORARY
 from mops_lightning.ops import propagation
-from tests.support.captured import done
+from tests.support.captured import done, refused
 from tests.support.cloud_files import contents, write_cloud
 from tests.support.clouds import line_of, normal_points, uniform_points
 from tests.support.downsample import call as downsample
@@ -373,3 +374,47 @@ def test_double_coordinates_near_the_origin_keep_every_bit(tmp_path):
 
     made = contents(tmp_path / "big_propagated.ply")
     assert_array_equal(made.points, points)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("big.LAZ", "big_propagated.LAZ"),
+        ("big.las", "big_propagated.las"),
+        ("big.copc.laz", "big_propagated.laz"),
+        ("big.npz", "big_propagated.ply"),
+    ],
+)
+def test_result_is_beside_the_cloud_in_its_format_if_that_can_be_written(name, expected, tmp_path):
+    small = tmp_path / "small.npz"
+    big = tmp_path / name
+    points = uniform_points(50, 1)
+    write_cloud(tmp_path / f"written{big.suffix.lower()}", points)
+    (tmp_path / f"written{big.suffix.lower()}").rename(big)
+    write_labelled(small, points[:3])
+
+    done(main, [small, big, *FIELD])
+
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([name, expected, "small.npz"])
+    assert len(contents(tmp_path / expected).points) == 50
+
+
+def test_sample_is_not_replaced_by_the_result(line_files):
+    small, big = line_files
+    sample = small.with_suffix(".ply")
+    write_cloud(sample, line_of(3), {"label": np.arange(3)})
+    before = sample.read_bytes()
+
+    said = refused(main, [sample, big, sample, *FIELD, "--overwrite"])
+
+    assert "OUT must differ from SMALL and BIG" in said
+    assert sample.read_bytes() == before
+
+
+def test_what_a_killed_run_left_beside_the_result_is_removed(line_files, tmp_path):
+    left = tmp_path / f"{TEMPORARY}out-x.ply"
+    left.write_bytes(b"half")
+
+    done(main, [*line_files, tmp_path / "out.ply", *FIELD])
+
+    assert not left.exists()
