@@ -65,7 +65,7 @@ def die(*_):
 
 @pytest.mark.parametrize(("workers", "threads"), [(1, 8), (3, 2), (8, 1), (99, 1)])
 def test_workers_share_the_cores_of_the_machine(workers, threads, tmp_path, monkeypatch):
-    chosen = []
+    chosen: list[int] = []
     monkeypatch.setattr(os, "cpu_count", lambda: 8)
     monkeypatch.setattr("torch.set_num_threads", chosen.append)
     np.save(tmp_path / "a.npy", uniform_points(20, 0))
