@@ -1,8 +1,11 @@
 import pytest
 import torch
 
+from mops_lightning.errors import UserError
 from mops_lightning.seeding import generator
-from mops_lightning.training.run.build import split
+from mops_lightning.training.checkpoint import Checkpoint, Ending
+from mops_lightning.training.run.build import _lengthens, split
+from tests.support.command_line import job
 from tests.support.training import small_dataset
 
 
@@ -61,3 +64,34 @@ def test_split_holds_out_whole_sources():
     assert held_out.sources is not None
     _, counts = held_out.sources.unique(return_counts=True)
     assert counts.tolist() == [4, 4]
+
+
+UNTOLD = Ending()
+STOPPED = Ending(should_stop=True)
+
+
+@pytest.mark.parametrize(
+    ("planned", "epochs", "ending", "lengthens"),
+    [
+        (3, 3, UNTOLD, False),
+        (3, 4, UNTOLD, True),
+        (3, 2, UNTOLD, False),
+        (3, 4, STOPPED, False),
+        (-1, 5, UNTOLD, False),
+        (3, -1, UNTOLD, False),
+    ],
+)
+def test_training_is_lengthened_by_more_epochs_than_were_planned(
+    planned, epochs, ending, lengthens, tmp_path
+):
+    resumed = Checkpoint(tmp_path, {}, planned, done=2, steps=2, ending=ending)
+
+    assert _lengthens(resumed, epochs) == lengthens
+
+
+def test_weights_for_a_net_without_any_are_refused(tmp_path):
+    settings = ["task=registration", "task/net=plane_icp", "sampler=fps"]
+    said = r"weights: plane_icp has no weights to load, got pcrnet\.modelnet40\. Give weights=null"
+
+    with pytest.raises(UserError, match=said):
+        job(tmp_path / "run", *settings, "weights=pcrnet.modelnet40")

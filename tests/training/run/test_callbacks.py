@@ -1,12 +1,23 @@
 """The callbacks group: standard ones, one left out, one added."""
 
+import sys
+import time
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 import torch
-from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint, RichProgressBar
 
 from mops_lightning.config.compose import compose
 from mops_lightning.errors import UserError
-from mops_lightning.training.run.callbacks import DEFAULT_CALLBACKS, EpochLines, build_callbacks
+from mops_lightning.training.run.callbacks import (
+    DEFAULT_CALLBACKS,
+    CPUTime,
+    EpochLines,
+    build_callbacks,
+    progress,
+)
 from mops_lightning.training.run.pictures import CloudVisualization, _Drawn
 from mops_lightning.zoo import weights
 from tests.support.command_line import TINY, done, job, runs
@@ -93,3 +104,70 @@ def test_pictures_are_drawn_ten_times_in_a_training_of_twenty_epochs(length, tmp
     job(tmp_path / "run", "weights=null", "pictures=1", "logger=tensorboard", *length)
 
     assert drawn == [0, 2, 4, 6, 8, 10, 12, 14, 16, 18]
+
+
+def shown_epoch(**changes):
+    """A trainer after its first epoch, as far as the lines of epochs read it."""
+    metrics = {
+        "val/generated/accuracy": torch.tensor(0.5),
+        "val/generated/mean_class_accuracy": torch.tensor(0.25),
+        "train/generated/accuracy": torch.tensor(0.75),
+        "train/mean_loss": torch.tensor(1.25),
+    }
+    facts = {
+        "callback_metrics": metrics,
+        "current_epoch": 0,
+        "is_global_zero": True,
+        "max_epochs": 3,
+        "sanity_checking": False,
+    }
+    return SimpleNamespace(**{**facts, **changes})
+
+
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        ({}, "epoch 1/3  val/generated/accuracy 0.5000  train/mean_loss 1.2500\n"),
+        ({"max_epochs": -1}, "epoch 1  val/generated/accuracy 0.5000  train/mean_loss 1.2500\n"),
+        ({"current_epoch": 2, "sanity_checking": True}, "epoch 3/3  train/mean_loss 1.2500\n"),
+        ({"is_global_zero": False}, ""),
+    ],
+)
+def test_epoch_lines_show_the_loss_and_the_score_of_the_first_process(changes, line, capsys):
+    trainer: Any = shown_epoch(**changes)
+    lines = EpochLines("accuracy")
+
+    lines.on_validation_end(trainer, Any)
+    lines.on_train_epoch_end(trainer, Any)
+
+    assert capsys.readouterr().out == line
+
+
+def test_cpu_time_adds_the_process_time_of_all_attempts(monkeypatch):
+    clock = iter([5.0, 7.5, 9.0])
+    monkeypatch.setattr(time, "process_time", lambda: next(clock))
+    trainer: Any = None
+    counter = CPUTime()
+    counter.load_state_dict({"seconds": 100.0})
+
+    assert counter.seconds == 100.0
+    counter.on_train_start(trainer, trainer)
+    assert counter.state_dict() == {"seconds": 102.5}
+    counter.on_train_end(trainer, trainer)
+    assert counter.seconds == 104.0
+
+
+@pytest.mark.parametrize(("is_terminal", "kind"), [(True, RichProgressBar), (False, EpochLines)])
+def test_progress_is_a_bar_on_a_terminal_only(is_terminal, kind, monkeypatch):
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: is_terminal)
+
+    assert type(progress("accuracy")) is kind
+
+
+@pytest.mark.parametrize(("logged", "number"), [(True, 1), (False, 0)])
+def test_learning_rate_is_watched_where_there_is_a_logger(logged, number, tmp_path):
+    offered = {"folder": tmp_path, "checkpoint": tmp_path / "last.ckpt", "score": "accuracy"}
+
+    made = build_callbacks(compose([]).callbacks, offered, logged=logged)
+
+    assert len([one for one in made if isinstance(one, LearningRateMonitor)]) == number

@@ -149,3 +149,30 @@ def test_factory_refuses_net_of_another_task(task, net):
 
     with pytest.raises(UserError, match=rf"task/net={net} takes .*, but task={task} gives"):
         make_experiment(cfg, small_dataset(), {})
+
+
+def test_factory_passes_the_settings_of_the_run_on():
+    given = ["learn=joint", "seed=7", "task_lr_scale=0.5", "sampler=fmops", "sampler.m_max=16"]
+    identity = {"m": "8"}
+
+    made = make_experiment(compose([*given, "m=8", "sizes=[4]"]), small_dataset(), identity)
+
+    assert (made.learn, made.seed, made.task_lr_scale) == ("joint", 7, 0.5)
+    assert (made.m, made.sizes) == (8, (4, 8))
+    assert made.identity is identity
+    assert made.test_logger is False
+    assert made.recipe.task_points is None
+
+
+def test_factory_counts_the_points_of_the_smallest_cloud_of_both_splits():
+    dataset = small_dataset()
+    sizes = torch.full((len(dataset.train.labels),), 48)
+    sizes[5] = 6
+    data = replace(dataset, train=dataset.train._replace(sizes=sizes))
+
+    with pytest.raises(UserError, match="at most the 6 points of a cloud, got 8"):
+        make_experiment(compose(["sampler=fps", "m=8"]), data, {})
+
+
+def test_factory_keeps_the_points_of_a_task_net_that_is_trained_alone():
+    assert experiment("recipe.task_points=20", "learn=task").recipe == Recipe(task_points=20)

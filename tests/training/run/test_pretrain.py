@@ -273,3 +273,29 @@ def test_wrong_optimizer_of_a_cached_task_net_is_an_error(mistake, tmp_path):
 
     with pytest.raises(UserError, match=r"^pretrain[.:]"):
         train(tmp_path, *SMALL_PCRNET, "sampler=fps", mistake)
+
+
+def test_training_of_a_task_net_starts_from_given_weights(tmp_path):
+    task = ["learn=task", *SMALL_PCRNET]
+    train(tmp_path, *task)
+    start = f"pretrain_from={tmp_path}/run0"
+
+    record = train(tmp_path, *task, start, "optimizer.lr=1e-30")
+
+    first, second = states(tmp_path, "run*/weights.safetensors")
+    torch.testing.assert_close(first, second, rtol=0, atol=1e-20)  # at this rate nothing moves
+    assert record.weights_loaded == weights.read(tmp_path / "run0" / weights.FILE)["sha256"]
+    other = "task.net.feature_channels=[8,16]"
+    with pytest.raises(UserError, match=r"^pretrain_from: .* holds another net's weights"):
+        train(tmp_path, *task, start, other)
+
+
+def test_cache_is_below_the_home_folder_and_names_task_net_and_data(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    cfg = compose([*TINY, "cache='~/mine'", "learn=task"])
+
+    folder = cache_folder(cfg, build(cfg.dataset, "dataset"))
+
+    assert folder.parent == tmp_path / "mine" / "weights"
+    assert folder.name.startswith("classification-pointnet-shapes-")
+    assert len(folder.name.rpartition("-")[2]) == 12

@@ -1,6 +1,9 @@
+import math
 import time
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
@@ -8,10 +11,13 @@ from omegaconf import OmegaConf
 from mops_lightning.config.compose import compose
 from mops_lightning.errors import Interrupted, UserError
 from mops_lightning.records import run_record
-from mops_lightning.training.checkpoint import CHECKPOINT
+from mops_lightning.training.checkpoint import CHECKPOINT, Diverged
 from mops_lightning.training.run.checkpoint_io import AtomicCheckpointIO
 from mops_lightning.training.run.recorded import recorded
-from tests.support.command_line import job
+from mops_lightning.training.run.run import run
+from mops_lightning.training.run.stages import _check_scores
+from tests.support.command_line import TINY_ANY_DATA, job
+from tests.support.hdf5 import write_file
 
 
 def plain(overrides: list[str]) -> Any:
@@ -101,3 +107,30 @@ def test_steps_of_accumulated_gradients_are_counted_with_the_last_of_an_epoch(
     record = job(tmp_path / "run", "weights=null", "recipe=paper", *accumulated, *limits)
 
     assert record.partial == partial
+
+
+def test_run_on_clouds_far_from_the_unit_sphere_says_so(tmp_path, capsys):
+    for split in ("train", "test"):
+        points = np.random.default_rng(0).normal(size=(4, 64, 3)).astype(np.float32)
+        write_file(tmp_path / f"{split}.h5", data=1000 * points, label=np.arange(4) % 2)
+    given = ["dataset=hdf5", f"dataset.root={tmp_path}", "sampler=fps", "weights=null"]
+    settings = [*TINY_ANY_DATA, *given, f"cache={tmp_path}/cache"]
+
+    run(compose(settings), tmp_path / "run", settings)
+
+    assert "from the origin, but nets and samplers are made for the unit" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["test/generated/accuracy", "test/loss/cross_entropy"])
+def test_score_or_loss_that_is_not_finite_ends_a_test_of_given_nets(name):
+    parts: Any = SimpleNamespace(
+        trains=False, experiment=SimpleNamespace(score_name="test/generated/accuracy")
+    )
+    others = {"test/matched/accuracy": math.nan, "test/loss/cross_entropy": 1.0}
+
+    _check_scores(parts, others)
+    with pytest.raises(UserError, match=rf"{name} is nan\. Check the data and the weights\."):
+        _check_scores(parts, {**others, name: math.nan})
+    parts.trains = True
+    with pytest.raises(Diverged, match=f"training diverged: {name} is inf"):
+        _check_scores(parts, {**others, name: math.inf})
