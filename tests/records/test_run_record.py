@@ -1,7 +1,9 @@
 import json
 import math
+import platform
 import shutil
 import subprocess
+import time
 from dataclasses import replace
 
 import pytest
@@ -94,7 +96,11 @@ def test_begun_record_is_read_as_written(tmp_path):
     run_record.write(tmp_path, started)
     found = run_record.read(tmp_path)
     assert replace(found, digest=None) == started
-    assert {"python", "torch", "lightning", "mops-lightning"} <= set(found.versions)
+    assert set(found.versions) == {"python", *run_record.PACKAGES}
+    assert {"torch", "lightning", "mops-lightning", "torchmetrics"} <= set(run_record.PACKAGES)
+    assert found.versions["python"] == platform.python_version()
+    assert found.platform == f"{platform.system()} {platform.machine()}"
+    assert found.started.endswith("+00:00")
     assert (found.status, found.seed) == ("running", 3)
     assert found.seconds["fit"] >= 0
 
@@ -131,10 +137,14 @@ def test_record_that_was_moved_or_has_no_digest_is_not_edited(tmp_path):
     assert not run_record.from_plain(moved).is_edited
     whole_seconds = {**plain, "seconds": {"total": 1}}  # equal numbers, written in another way
     assert not run_record.from_plain(whole_seconds).is_edited
-    without_empty_fields = {
-        name: value for name, value in plain.items() if value not in (None, {}, [])
-    }
+    without_empty_fields = {}
+    for name, value in plain.items():
+        if value is not False and value not in (None, {}, []):
+            without_empty_fields[name] = value
+    assert "lengthened" not in without_empty_fields
     assert not run_record.from_plain(without_empty_fields).is_edited
+    elsewhere = {**plain, "files": {"weights": "../kept/weights.safetensors"}}
+    assert not run_record.from_plain(elsewhere).is_edited
     of_earlier_version = {name: value for name, value in plain.items() if name != "digest"}
     of_earlier_version["metrics"] = {"test/generated/accuracy": 0.9}
     assert not run_record.from_plain(of_earlier_version).is_edited
@@ -163,3 +173,35 @@ def test_git_state_is_the_commit_and_whether_a_file_of_it_was_changed(tmp_path, 
 
     code.write_text("second\n")
     assert run_record.git_state() == {"commit": commit, "dirty": True}
+
+
+def test_timed_records_milliseconds_also_after_an_error(monkeypatch):
+    clock = iter([1.0, 2.23456, 5.0, 5.5])
+    monkeypatch.setattr(time, "perf_counter", lambda: next(clock))
+    made = record()
+
+    with made.timed("fit"):
+        pass
+    with pytest.raises(UserError), made.timed("test"):
+        raise UserError("no")
+
+    assert made.seconds == {"total": 1.0, "fit": 1.235, "test": 0.5}
+
+
+def test_records_of_several_runs_name_folders_relative_to_their_file(tmp_path):
+    found = [record(folder=str(tmp_path / "runs" / name)) for name in ("a", "b")]
+
+    run_record.write_many(tmp_path / "kept" / "runs.jsonl", found)
+
+    lines = (tmp_path / "kept" / "runs.jsonl").read_text().splitlines()
+    assert [json.loads(line)["folder"] for line in lines] == ["../runs/a", "../runs/b"]
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
+def test_git_state_of_a_broken_checkout_is_unknown(tmp_path, monkeypatch):
+    folder = tmp_path / "src" / "mops_lightning" / "records"
+    folder.mkdir(parents=True)
+    (tmp_path / ".git").write_text("gitdir: nowhere\n")
+    monkeypatch.setattr(run_record, "__file__", str(folder / "run_record.py"))
+
+    assert run_record.git_state() == {"commit": None, "dirty": None}

@@ -1,6 +1,7 @@
 from io import StringIO
 from pathlib import Path
 
+import pytest
 from rich.console import Console
 from torchmetrics.aggregation import SumMetric
 
@@ -208,3 +209,27 @@ def test_run_of_registration_without_a_trained_sampler_ends_without_advice():
     text = printed(metrics, "test/sampled/rotation_error_deg", names=of_pairs)
 
     assert "Use" not in text
+
+
+class Accurate(SumMetric):
+    """A user's metric under the name of one of this package."""
+
+    name = "accuracy"
+
+
+@pytest.mark.parametrize(
+    ("name", "metric", "is_described"),
+    [
+        ("accuracy", Accuracy(3), False),
+        ("exactness", Accuracy(3), True),
+        ("accuracy", Accurate(), True),
+    ],
+)
+def test_metrics_of_other_names_or_classes_are_described_in_the_record(name, metric, is_described):
+    assert (name in foreign_metrics([(name, metric)])) == is_described
+
+
+def test_title_of_a_task_net_alone_names_its_points_and_the_noise():
+    metrics = {"test/full/accuracy": 0.5}
+    text = printed(metrics, "test/full/accuracy", learn="task", test_noise_std=0.1)
+    assert "classification by pointnet, shapes, all points, test, test_noise_std=0.1\n" in text

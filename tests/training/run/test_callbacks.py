@@ -135,10 +135,11 @@ def shown_epoch(**changes):
 )
 def test_epoch_lines_show_the_loss_and_the_score_of_the_first_process(changes, line, capsys):
     trainer: Any = shown_epoch(**changes)
+    module: Any = None
     lines = EpochLines("accuracy")
 
-    lines.on_validation_end(trainer, Any)
-    lines.on_train_epoch_end(trainer, Any)
+    lines.on_validation_end(trainer, module)
+    lines.on_train_epoch_end(trainer, module)
 
     assert capsys.readouterr().out == line
 
