@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -60,9 +61,39 @@ def test_isolated_failure_is_one_error(kind, message, path):
 @pytest.mark.skipif(not hasattr(signal, "SIGALRM"), reason="the system has no timer")
 def test_isolated_slow_parser_is_ended(path, monkeypatch):
     isolated(parse, path)  # starts the process
-    monkeypatch.setattr(module, "SECONDS", 1.0)
+    monkeypatch.setattr(module, "SECONDS", 0.25)
+    monkeypatch.setattr(module, "BYTES_PER_SECOND", 5 / 0.75)  # of five bytes
     with pytest.raises(UserError, match=r"a\.laz is broken: reading it took more than 1 s"):
         isolated(parse, path, "hang")
+
+
+def content(path):
+    return path.read_text()
+
+
+def test_isolated_reads_relative_paths_from_the_callers_current_folder(tmp_path, monkeypatch):
+    for name in ("first", "second"):
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / "a.xyz").write_text(name)
+        monkeypatch.chdir(folder)
+
+        assert isolated(content, Path("a.xyz")) == name
+
+
+@pytest.mark.skipif(module.resource is None, reason="the system has no limits")
+def test_limits_of_a_call_end_with_it():
+    resource = module.resource
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+
+    with module._limited(1000.0, 2**50):
+        during = signal.getitimer(signal.ITIMER_REAL)[0]
+        limit = resource.getrlimit(resource.RLIMIT_DATA)[0]
+
+    assert 900 < during <= 1000
+    assert limit == 2**50
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+    assert resource.getrlimit(resource.RLIMIT_DATA) == before
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")

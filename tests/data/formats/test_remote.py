@@ -9,6 +9,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from mops_lightning.data.formats.area import Area
+from mops_lightning.data.formats.registry import read
 from mops_lightning.data.formats.remote import local
 from mops_lightning.errors import UserError
 from tests.support.cloud_files import contents, write_cloud
@@ -90,6 +91,28 @@ def test_area_of_remote_file_equals_local_file(options, server, tmp_path):
     expected = contents(of_local)
     assert_array_equal(found.points, expected.points)
     assert_array_equal(found.columns["intensity"], expected.columns["intensity"])
+
+
+def test_file_whose_records_take_more_than_the_first_bytes_is_read(server, monkeypatch):
+    address, folder, _ = server
+    monkeypatch.setattr("mops_lightning.data.formats.remote.HEAD", 400)  # the points begin later
+
+    with local(f"{address}/fine/scan.copc.laz", COARSE) as path:
+        found = read(path, 1, 0, COARSE)
+
+    expected = read(folder / "scan.copc.laz", 1, 0, COARSE)
+    assert_array_equal(found.points, expected.points)
+
+
+def test_remote_file_in_capitals_is_read(server):
+    address, folder, _ = server
+    content = (folder / "scan.copc.laz").read_bytes()
+    (folder / "SCAN.COPC.LAZ").write_bytes(content)
+
+    with local(f"{address}/fine/SCAN.COPC.LAZ", COARSE) as path:
+        found = read(path, 1, 0, COARSE)
+
+    assert len(found.points) > 300
 
 
 @pytest.mark.parametrize(
