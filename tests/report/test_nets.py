@@ -112,3 +112,39 @@ def test_nets_grid_names_samplers_inside_and_shows_no_figure_of_another_net(tmp_
         ["hierarchical", "mops", "fps", "1024", "50.00", "4.1"],
         ["hierarchical", "mops", "none", "1024", "50.00", "4.1"],
     ]
+
+
+def test_nets_grid_shows_mean_times_sizes_and_changed_checkouts(tmp_path):
+    for seed, seconds in ((0, 1000.0), (1, 2000.4)):
+        path = put_net(tmp_path, f"{seed}", {"accuracy": 0.5}, "classification", "pointnet")
+        git = {"commit": "c" * 40, "dirty": seed == 1}
+        times = {"total": 9000.0, "fit": seconds}
+        edited(path, seed=seed, seconds=times, parameters={"task": 2_500_000}, git=git)
+
+    text = table(tmp_path)
+
+    assert rows(text) == [
+        ["net", "points", "accuracy (%)", "MB", "training (wall)", "*the paper's*"],
+        ["pointnet", "1024", "50.00 ± 0.00 (n=2) †", "10.0", "1,500 s", "87.10"],
+    ]
+    assert "† With a run whose checkout had changes that no commit has." in text
+
+
+def test_nets_grid_shows_requested_metrics_in_their_order(tmp_path):
+    distances = {"nre_cd": 1.0, "chamfer": 0.5, "emd": 0.25}
+    put_net(tmp_path, "mlp", distances, "reconstruction", "autoencoder")
+
+    head, line = rows(table(tmp_path, "emd", "nre_cd"))
+
+    assert head[2:4] == ["emd", "nre cd"]
+    assert line[2:4] == ["0.25", "1"]
+
+
+def test_nets_of_one_size_are_sorted_by_numbers_not_texts(tmp_path):
+    for width in (16, 128, 8):
+        given = ("classification", "pointnet")
+        put_net(tmp_path, f"{width}", {"accuracy": width / 1000}, *given, width=width)
+
+    _, *lines = rows(table(tmp_path))
+
+    assert [line[1] for line in lines] == ["8", "16", "128"]

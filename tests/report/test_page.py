@@ -2,13 +2,17 @@
 
 import base64
 import hashlib
+import json
 import re
 
 import pytest
 import torch
 
+from mops_lightning.report.build import build_report
 from mops_lightning.report.cli import main
-from mops_lightning.viz.figures import save_clouds
+from mops_lightning.report.page import page, render
+from mops_lightning.report.text import PAPER, Grid
+from mops_lightning.viz.figures import COLOURS, INPUT_COLOUR, save_clouds
 from tests.support.reports import put, put_planes
 
 
@@ -128,3 +132,74 @@ def test_page_runs_its_own_scripts_only(reported):
     assert digests == set(allowed)
     assert len(digests) == 2
     assert '<meta name="viewport"' in text
+
+
+def data_of(text):
+    """The clouds in a page, as its script reads them."""
+    (data,) = re.findall(r'<script [^>]*id="data"[^>]*>(.*?)</script>', text, re.DOTALL)
+    return json.loads(data)
+
+
+def test_page_holds_rounded_clouds_in_their_colours_and_hides_completed_sets(tmp_path):
+    cloud = torch.tensor([[[0.12345, 0.5, -0.98765]]])
+    sets = {"generated": cloud, "completed": cloud, "mine": cloud}
+    path = put(tmp_path, "mops", 32, {"test/generated/accuracy": 0.5}, files={"clouds": "c.npz"})
+    save_clouds(path.parent / "c.npz", cloud, sets, ["<b>chair"])
+
+    text = page(build_report(tmp_path), tmp_path, [])
+
+    (shown,) = data_of(text)
+    assert shown["name"] == "mops-32-pointnet"
+    assert shown["titles"] == ["<b>chair"]
+    assert list(shown["points"]) == ["input", "generated", "completed", "mine"]
+    for points in shown["points"].values():
+        assert points == [[[0.123, 0.5, -0.988]]]
+    assert shown["hidden"] == ["completed"]
+    assert shown["colours"]["input"] == f"rgb{INPUT_COLOUR}"
+    assert shown["colours"]["generated"] == f"rgb{COLOURS['generated']}"
+    assert shown["colours"]["mine"] == f"rgb{COLOURS['sampled']}"
+    assert "<b>chair" not in text
+
+
+def test_page_shows_the_clouds_of_at_most_24_runs_and_names_damaged_files(tmp_path):
+    cloud = torch.rand(1, 4, 3)
+    for number in range(26):
+        scores = {"test/sampled/accuracy": 0.5}
+        folder = tmp_path / f"{number:02}"
+        path = put(folder, "fps", number + 1, scores, files={"clouds": "c.npz"})
+        save_clouds(path.parent / "c.npz", cloud, {"sampled": cloud}, ["chair"])
+    damaged = tmp_path / "03" / "fps-4-pointnet" / "c.npz"
+    damaged.write_bytes(b"no clouds")
+
+    text = page(build_report(tmp_path), tmp_path, [])
+
+    numbers = [int(shown["name"].partition("/")[0]) for shown in data_of(text)]
+    assert numbers == [0, 1, 2, *range(4, 25)]
+    assert f"<li>{damaged}: " in text
+
+
+def test_page_has_remarks_lines_below_tables_and_no_script_for_clouds_without_any():
+    grid = Grid("a & b", ["*head*", "m"], [["<x>", "1"], [PAPER, "*2*"]], ["below & more"])
+
+    text = render("title <", [grid], [], ["- first <", "", "between"], "made", choice="Run")
+
+    assert "<h1>title &lt;</h1>" in text
+    assert "<p>a &amp; b</p>" in text
+    assert "<th>head</th><th>m</th>" in text
+    assert (
+        "<tr><td>&lt;x&gt;<small>the paper&#x27;s</small></td><td>1<small>2</small></td></tr>"
+        in (text)
+    )
+    assert "<p>below &amp; more</p>" in text
+    assert "<li>first &lt;</li></ul><p>between</p><ul>" in text
+    assert "unsafe-eval" not in text
+    assert "Sampled clouds" not in text
+
+
+def test_page_of_groups_with_another_name_calls_them_so():
+    group = {"name": "a", "titles": ["t"], "points": {}, "colours": {}, "hidden": []}
+
+    text = render("title", [], [group], [], "made", choice="Sampler")
+
+    assert "<label>Sampler <select" in text
+    assert "unsafe-eval" in text
