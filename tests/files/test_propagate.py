@@ -313,6 +313,7 @@ def test_colours_are_averaged_on_request(line_files, tmp_path):
     assert red.tolist() == [0, 50, 100, 100, 100]
 
 
+@pytest.mark.parametrize("name", ["rgb", "rgba"])
 @pytest.mark.parametrize(
     ("kind", "settings"),
     [
@@ -321,7 +322,7 @@ def test_colours_are_averaged_on_request(line_files, tmp_path):
         ("f4", []),
     ],
 )
-def test_packed_colours_are_averaged_channel_by_channel(kind, settings, tmp_path):
+def test_packed_colours_are_averaged_channel_by_channel(kind, settings, name, tmp_path):
     line = line_of(3)
     blue_green_red_alpha = [
         [0, 0, 200, 4],
@@ -333,11 +334,11 @@ def test_packed_colours_are_averaged_channel_by_channel(kind, settings, tmp_path
     big = tmp_path / "big.npz"
     out = tmp_path / "out.ply"
     write_cloud(big, line)
-    write_cloud(small, line[[0, 2]], {"rgb": packed})
+    write_cloud(small, line[[0, 2]], {name: packed})
 
-    done(main, [small, big, out, "--field", "rgb", "--k", 2, *settings])
+    done(main, [small, big, out, "--field", name, "--k", 2, *settings])
 
-    carried = np.ascontiguousarray(contents(out).columns["rgb"])
+    carried = np.ascontiguousarray(contents(out).columns[name])
     bytes_of_carried = carried.view(np.uint8).reshape(-1, 4)
     assert bytes_of_carried.tolist() == [
         [0, 0, 200, 4],
@@ -418,3 +419,41 @@ def test_what_a_killed_run_left_beside_the_result_is_removed(line_files, tmp_pat
     done(main, [*line_files, tmp_path / "out.ply", *FIELD])
 
     assert not left.exists()
+
+
+@pytest.mark.parametrize("kind", [np.uint64, np.float64, np.uint16])
+def test_packed_colours_of_other_sizes_are_not_averaged(kind, line_files, tmp_path):
+    _, big = line_files
+    small = tmp_path / "packed.npz"
+    write_cloud(small, line_of(3), {"rgb": np.arange(3).astype(kind)})
+
+    said = refused(main, [small, big, tmp_path / "out.ply", "--field", "rgb", "--k", 2, "--mean"])
+
+    kind_of_message = np.dtype(kind)
+    assert "--field rgb: only packed colours of 32 bits can be averaged" in said
+    assert f"got {kind_of_message}" in said
+
+
+def test_points_of_the_sample_without_coordinates_are_not_near(line_files, tmp_path):
+    _, big = line_files
+    small = tmp_path / "holes.npy"
+    out = tmp_path / "out.ply"
+    points = line_of(3)
+    points[1] = np.nan
+    write_scan(small, points, label=np.array([5, 6, 7], np.int32))
+
+    done(main, [small, big, out, *FIELD])
+
+    assert set(contents(out).columns["label"].tolist()) == {5, 7}
+
+
+def test_map_holds_the_number_of_kept_points(scan, tmp_path):
+    map_ = tmp_path / "map.npz"
+
+    downsample(scan, tmp_path / "small.ply", "--m", 30, "--method", "fps", "--map", map_)
+
+    arrays = np.load(map_)
+    assert int(arrays["m"]) == 30
+    assert arrays["rows"].shape == (500, 1)
+    assert arrays["rows"].dtype == np.int32
+    assert set(arrays.files) == {"rows", "m"}
