@@ -10,6 +10,7 @@ import pytest
 from mops_lightning.data.formats.las import packing
 from mops_lightning.data.formats.registry import read, write
 from mops_lightning.data.formats.table import Table
+from tests.support.las import full_cloud
 
 OLD_COUNTS, LONG_COUNTS = 107, 247
 """Places of the number of points, which those of each return follow."""
@@ -86,3 +87,37 @@ def test_new_file_has_the_day_on_which_it_is_written(tmp_path, monkeypatch):
     write(out, Table(np.eye(3)))
 
     assert laspy.read(out).header.creation_date == date(2028, 12, 31)
+
+
+@pytest.mark.parametrize("name", ["a.las", "a.laz"])
+def test_new_file_says_what_wrote_it_and_how_its_numbers_are_stored(name, tmp_path):
+    path = tmp_path / name
+    points = np.array([[5.0, -2.0, 1.0], [13.0, 0.0, 1.5]])
+
+    write(path, Table(points))
+
+    head = path.read_bytes()
+    header = laspy.read(path).header
+    assert head[26:58] == b"OTHER".ljust(32, b"\0")
+    assert head[58:90] == b"mops_lightning".ljust(32, b"\0")
+    assert header.scales.tolist() == [8 / 2**30] * 3
+    assert header.offsets.tolist() == [5.0, -2.0, 1.0]
+    assert header.mins.tolist() == [5.0, -2.0, 1.0]
+    assert header.maxs.tolist() == [13.0, 0.0, 1.5]
+    assert header.are_points_compressed == (name == "a.laz")
+    assert (str(header.version), header.point_format.id) == ("1.2", 3)
+
+
+@pytest.mark.parametrize("target", ["b.las", "b.laz"])
+def test_copy_without_records_after_its_points_says_of_no_place_for_them(target, tmp_path):
+    source = tmp_path / "a.laz"
+    cloud = full_cloud(6)
+    cloud.evlrs = None
+    cloud.write(source)
+
+    write(tmp_path / target, read(source, 1, 0))
+
+    head = (tmp_path / target).read_bytes()
+    place, number = struct.unpack_from("<QI", head, 235)
+    assert (place, number) == (0, 0)
+    assert bool(head[104] & 0x80) == (target == "b.laz")
