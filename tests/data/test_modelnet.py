@@ -97,6 +97,14 @@ def test_modelnet_lists_written_on_windows_name_the_same_files(layout):
     assert again.fingerprint == dataset.fingerprint
 
 
+def test_modelnet_archive_is_the_published_one():
+    assert modelnet.ARCHIVE_HASH == "md5:c9ab8e6dfb16f67afdab25e155c79e59"
+    assert modelnet.MIRRORS == (
+        "https://huggingface.co/datasets/Msun/modelnet40/resolve/main/modelnet40_ply_hdf5_2048.zip",
+        "https://shapenet.cs.stanford.edu/media/modelnet40_ply_hdf5_2048.zip",
+    )
+
+
 def test_modelnet_missing_folder_raises(tmp_path):
     missing = tmp_path / "none"
 

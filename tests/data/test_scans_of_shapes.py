@@ -9,6 +9,7 @@ import torch
 from mops_lightning.data.procedural.scenes import scan_of_shape
 from mops_lightning.data.scans_of_shapes import scans_of_shapes
 from mops_lightning.errors import UserError
+from mops_lightning.filesystem import TEMPORARY
 from mops_lightning.records.run_record import read
 from mops_lightning.samplers.fps import FPSSampler
 from tests.support.command_line import TINY_ANY_DATA, done, runs
@@ -314,6 +315,15 @@ def test_scans_from_cache_equal_made_ones(tmp_path):
     assert torch.equal(repaired.train.points, made.train.points)
     assert again.channels == made.channels
     assert repaired.channels == made.channels
+
+
+def test_scans_cache_loses_what_a_killed_run_left(tmp_path):
+    left = tmp_path / f"{TEMPORARY}scans-x.npz"
+    left.write_bytes(b"half")
+
+    scans_of_shapes(**SMALL, cache=tmp_path)
+
+    assert not left.exists()
 
 
 def test_scans_keep_global_random_state():

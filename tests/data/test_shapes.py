@@ -13,6 +13,7 @@ from mops_lightning.data.procedural.sampled import BUILDERS
 from mops_lightning.data.shapes import ASYMMETRIC, CLASSES, PARTS, shapes
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import TEMPORARY
+from mops_lightning.filesystem import TEMPORARY
 
 SMALL: dict[str, Any] = {
     "n_points": 64,
@@ -333,6 +334,15 @@ def test_shapes_cache_is_written_and_read(tmp_path):
     assert torch.equal(again.train.labels, train.labels)
     assert again.test.parts is not None
     assert again.test.parts.tolist() == parts[1].tolist()
+
+
+def test_shapes_cache_loses_what_a_killed_run_left(tmp_path):
+    left = tmp_path / f"{TEMPORARY}shapes-x.npz"
+    left.write_bytes(b"half")
+
+    shapes(**SMALL, cache=tmp_path)
+
+    assert not left.exists()
 
 
 def test_shapes_damaged_cache_or_one_of_other_shapes_is_replaced(tmp_path):
