@@ -13,7 +13,6 @@ from mops_lightning.data.procedural.sampled import BUILDERS
 from mops_lightning.data.shapes import ASYMMETRIC, CLASSES, PARTS, shapes
 from mops_lightning.errors import UserError
 from mops_lightning.filesystem import TEMPORARY
-from mops_lightning.filesystem import TEMPORARY
 
 SMALL: dict[str, Any] = {
     "n_points": 64,
