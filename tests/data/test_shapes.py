@@ -335,15 +335,6 @@ def test_shapes_cache_is_written_and_read(tmp_path):
     assert again.test.parts.tolist() == parts[1].tolist()
 
 
-def test_shapes_cache_loses_what_a_killed_run_left(tmp_path):
-    left = tmp_path / f"{TEMPORARY}shapes-x.npz"
-    left.write_bytes(b"half")
-
-    shapes(**SMALL, cache=tmp_path)
-
-    assert not left.exists()
-
-
 def test_shapes_damaged_cache_or_one_of_other_shapes_is_replaced(tmp_path):
     fresh = shapes(**SMALL, cache=tmp_path)
     (path,) = tmp_path.iterdir()
