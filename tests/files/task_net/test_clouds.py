@@ -113,3 +113,60 @@ def test_halves_share_the_files_of_every_class(tmp_path):
         halves = [source.half for source in sources if source.label == label]
         assert halves.count(CHOOSING) == 2
         assert halves.count(CHECKING) == 2
+
+
+def test_class_of_a_file_is_the_nearest_folder_that_is_one(tmp_path):
+    classes = ("tall", "flat", "round")
+    net = nn.Identity()
+    of_classes = replace(subject(outputs=classes), task=with_outputs(net, "class_names"))
+    folder = tmp_path / "flat" / "tall" / "scans"
+    folder.mkdir(parents=True)
+    np.save(folder / "a.npy", uniform_points(70, 0))
+
+    (source,) = read_sources([folder / "a.npy"], of_classes, 0, None)
+
+    assert source.label == 0
+
+
+def with_outputs(net, names):
+    """Return a task whose net tells classes or parts apart."""
+    task = subject_of_module(net, lambda output, batch: output, 64, 2, None).task
+    task.output_names = names
+    return task
+
+
+def test_classes_of_a_module_are_the_folders_in_alphabetical_order(tmp_path):
+    paths = []
+    for name in ("tall", "flat", "round"):
+        (tmp_path / name).mkdir()
+        paths.append(tmp_path / name / "a.npy")
+        np.save(paths[-1], uniform_points(70, 0))
+
+    sources = read_sources(paths, subject(), 0, None)
+
+    assert [source.label for source in sources] == [2, 0, 1]
+
+
+def test_columns_name_those_of_bin_files_and_points_that_are_not_finite_are_left_out(tmp_path):
+    path = tmp_path / "a.bin"
+    points = uniform_points(80, 0).astype(np.float32)
+    points[:10] = np.nan
+    np.insert(points, 0, 7.0, axis=1).tofile(path)
+
+    (source,) = read_sources([path], subject(), 0, ("i", "x", "y", "z"))
+
+    assert np.array_equal(source.points, points[10:].astype(np.float64))
+
+
+def test_halves_depend_on_the_seed(tmp_path):
+    paths = []
+    for number in range(8):
+        paths.append(tmp_path / f"{number}.npy")
+        np.save(paths[-1], uniform_points(70, number))
+
+    halves = set()
+    for seed in range(4):
+        sources = read_sources(paths, subject(), seed, None)
+        halves.add(tuple(source.half for source in sources))
+
+    assert len(halves) > 1

@@ -113,3 +113,32 @@ def test_sampler_that_sees_other_channels_is_refused(scans, tmp_path):
 def test_net_or_loss_of_another_kind_is_refused(net, loss, said, scans):
     with pytest.raises(UserError, match=said):
         compare_task_net(scans, net, [8], loss=loss, **SMALL)
+
+
+def test_module_of_ones_own_is_evaluated_and_sizes_are_compared_once(scans):
+    net = nn.Sequential(nn.Dropout(0.9), Extent()).train()
+
+    result = compare_task_net(scans, net, [16, 8, 16], loss=distance, **SMALL)
+
+    assert not net.training
+    whole = result.frame[result.frame.files == "all"]
+    assert whole[whole.method == "all points"].loss.max() == 0
+    assert len(whole[whole.method == "random"]) == 2 * 3
+
+
+def test_loss_of_a_batch_or_of_each_cloud_has_the_same_mean(scans):
+    def mean(output, batch):
+        return distance(output, batch).mean()
+
+    of_clouds = compare_task_net(scans, Extent(), [8], loss=distance, **SMALL)
+    of_batches = compare_task_net(scans, Extent(), [8], loss=mean, **SMALL)
+
+    assert of_batches.frame.loss.to_list() == pytest.approx(of_clouds.frame.loss.to_list())
+
+
+def test_loss_that_is_infinite_is_refused(scans):
+    def endless(output, batch):
+        return output.sum() * float("inf")
+
+    with pytest.raises(UserError, match=r"the loss of Extent must be finite; .* it is -?inf"):
+        compare_task_net(scans, Extent(), [8], loss=endless, **SMALL)

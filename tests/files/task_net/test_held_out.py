@@ -5,7 +5,7 @@ from pathlib import PurePosixPath
 import pytest
 
 from mops_lightning.data.file_splits import split_by_share
-from mops_lightning.files.task_net.held_out import without_training_files
+from mops_lightning.files.task_net.held_out import files_of, without_training_files
 
 NAMES = [f"scan_{number}.ply" for number in range(10)]
 
@@ -74,3 +74,13 @@ def test_files_of_classes_that_a_run_did_not_take_are_kept(tmp_path):
 
     classes = [file.parent.name for file in kept]
     assert classes == ["car"] * 3 + ["tree"] * 6
+
+
+def test_file_that_several_paths_name_is_compared_once(files):
+    folder = files[0].parent
+    link = folder / "link.ply"
+    link.symlink_to(files[3])
+
+    found = files_of([files[3], folder, files[0]])
+
+    assert found == [files[3], *files[:3], *files[4:]]

@@ -1,14 +1,19 @@
 """The methods of a comparison, and how they are saved."""
 
+from pathlib import Path
+
 import pandas as pd
 import pytest
 import torch
 
-from mops_lightning import load
+from mops_lightning import FMOPSNet, MOPSNet, load
+from mops_lightning.channels import NO_CHANNELS, Channel, PointChannels
+from mops_lightning.errors import UserError
 from mops_lightning.files.task_net import keep
-from mops_lightning.files.task_net.methods import FPS_FARTHEST, Untrained
+from mops_lightning.files.task_net.methods import FPS_FARTHEST, Trained, Untrained, _names
 from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.ops.points import normalize_unit_sphere
+from mops_lightning.samplers.by_budget import rows_in_unit_sphere
 from mops_lightning.zoo.names import UNTRAINED
 
 
@@ -98,3 +103,78 @@ def test_rejected_method_is_replaced_by_the_better_farthest_points_of_the_first_
     assert choice.line == (
         "16 points: fps; random was 20 percentage points worse on the other half"
     )
+
+
+def test_names_of_several_samplers_are_their_own_or_numbered():
+    given = ["runs/small", "other/small", "zoo/random", "zoo/large", FMOPSNet(8)]
+
+    assert _names(given) == ["small_1", "small_2", "random_3", "large", "FMOPSNet"]
+    assert _names(["runs/small"]) == ["trained"]
+
+
+def test_sampler_in_memory_is_evaluated_at_every_size_that_it_was_trained_for():
+    sampler = FMOPSNet(16).train()
+
+    method = Trained(sampler, "mine", NO_CHANNELS)
+
+    assert not method.sampler.training
+    assert [method.takes(m) for m in (1, 15, 16, 17)] == [True, True, True, False]
+    of_one_size = Trained(MOPSNet(16), "mine", NO_CHANNELS)
+    assert [of_one_size.takes(m) for m in (15, 16, 17)] == [False, True, False]
+
+
+def test_sampler_sees_channels_scaled_as_in_its_own_training(rng):
+    of_net = PointChannels([Channel("intensity", 10.0, 5.0)])
+    own = PointChannels([Channel("intensity", 100.0, 50.0)])
+    torch.manual_seed(0)
+    sampler = FMOPSNet(16, point_channels=own).eval()
+    sampler.queries.weight.data *= 100  # samples depend on the channels
+    places = normalize_unit_sphere(torch.rand(2, 60, 3, generator=rng))
+    intensity = 300 * torch.rand(2, 60, 1, generator=rng)
+    clouds = torch.cat([places, (intensity - 10) / 5], 2)
+
+    rows = Trained(sampler, "mine", of_net).rows(clouds, 9, 0)
+
+    of_sampler = torch.cat([places, (intensity - 100) / 50], 2)
+    assert torch.equal(rows, rows_in_unit_sphere(sampler, of_sampler, 9))
+    assert not torch.equal(rows, rows_in_unit_sphere(sampler, clouds, 9))
+
+
+def test_channels_of_two_samplers_are_those_that_one_of_them_has():
+    channels = PointChannels([Channel("intensity", 10.0, 5.0)])
+    others = PointChannels([Channel("intensity", 11.0, 5.0)])
+
+    assert keep._common(channels, NO_CHANNELS) == channels
+    assert keep._common(NO_CHANNELS, channels) == channels
+    assert keep._common(channels, channels) == channels
+    with pytest.raises(UserError, match="trained with other statistics of the channels"):
+        keep._common(channels, others)
+
+
+def test_file_of_a_saved_sampler_has_its_suffix_once(monkeypatch):
+    monkeypatch.setenv("HOME", "/home/me")
+
+    assert keep.file_of("best") == Path("best.safetensors")
+    assert keep.file_of("a/best.safetensors") == Path("a/best.safetensors")
+    assert keep.file_of("best.v2") == Path("best.v2.safetensors")
+    assert keep.file_of("~/best") == Path("/home/me/best.safetensors")
+
+
+def test_scores_are_ordered_by_size_and_draw_without_all_points():
+    rows = [
+        (1, "choosing", 16, "fps", 0.4),
+        (0, "choosing", 16, "fps", 0.3),
+        (0, "choosing", 8, "fps", 0.1),
+        (1, "choosing", 8, "fps", 0.2),
+        (0, "choosing", 0, "all points", 0.9),
+        (0, "checking", 8, "fps", 0.5),
+        (1, "checking", 8, "fps", 0.6),
+    ]
+    frame = pd.DataFrame(rows, columns=["draw", "files", "m", "method", "score"])
+
+    assert keep.by_size(frame, "choosing") == {8: {"fps": [0.1, 0.2]}, 16: {"fps": [0.3, 0.4]}}
+    assert list(keep.by_size(frame, "choosing")) == [8, 16]
+    assert keep.by_part(frame) == {
+        8: {"fps": [0.1, 0.2, 0.5, 0.6]},
+        16: {"fps": [0.3, 0.4]},
+    }
