@@ -13,6 +13,7 @@ from mops_lightning.files.task_net import keep
 from mops_lightning.files.task_net.methods import FPS_FARTHEST, Trained, Untrained, _names
 from mops_lightning.metrics.info import MetricInfo
 from mops_lightning.ops.points import normalize_unit_sphere
+from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.by_budget import rows_in_unit_sphere
 from mops_lightning.zoo.names import UNTRAINED
 
@@ -106,7 +107,13 @@ def test_rejected_method_is_replaced_by_the_better_farthest_points_of_the_first_
 
 
 def test_names_of_several_samplers_are_their_own_or_numbered():
-    given = ["runs/small", "other/small", "zoo/random", "zoo/large", FMOPSNet(8)]
+    given: list[str | Sampler] = [
+        "runs/small",
+        "other/small",
+        "zoo/random",
+        "zoo/large",
+        FMOPSNet(8),
+    ]
 
     assert _names(given) == ["small_1", "small_2", "random_3", "large", "FMOPSNet"]
     assert _names(["runs/small"]) == ["trained"]
