@@ -132,6 +132,8 @@ def may_follow(path, key):
     followers = {"m": PLACES[:2], "seed": PLACES}.get(key, ())
     if path in [f"{place}.{key}" for place in followers]:
         return True
+    if key == "seed" and path == "weights":  # a task net of every seed
+        return True
     if key == "sampler":  # a sampler may have an optimizer of its own
         return path.startswith(("sampler.", "optimizer.", "names.sampler"))
     if "@" in key:
