@@ -1,5 +1,7 @@
 """Nearest points and the chamfer distance against double loops, SciPy and torch."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -236,3 +238,12 @@ def test_chamfer_equals_plain_form(n, m, randn):
     gradients_of_sum = torch.autograd.grad(sum_of_clouds, inputs)
     expected_gradients = torch.autograd.grad(expected_sum, inputs)
     assert_close(gradients_of_sum, expected_gradients)
+
+
+@pytest.mark.parametrize("function", [nearest, partial(k_nearest, k=1), chamfer_distance])
+def test_nearest_of_no_points_raises(function):
+    queries = torch.zeros(1, 2, 3)
+    no_points = torch.zeros(1, 0, 3)
+
+    with pytest.raises(UserError, match="points must have at least one point per cloud, got N=0"):
+        function(queries, no_points)

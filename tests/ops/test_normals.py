@@ -109,3 +109,21 @@ def test_normals_of_equal_points_point_up():
 
     assert estimate_normals(equal).tolist() == [[0, 0, 1]] * 5
     assert estimate_normals(alone).tolist() == [[0, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("estimated", "upward"),
+    [
+        ([0.6, 0.0, -0.8], [-0.6, 0.0, 0.8]),
+        ([-0.6, 0.0, 0.8], [-0.6, 0.0, 0.8]),
+        ([0.6, -0.8, 0.0], [-0.6, 0.8, 0.0]),
+        ([-0.6, 0.8, 0.0], [-0.6, 0.8, 0.0]),
+        ([-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]),
+        ([1.0, 0.0, 0.0], [1.0, 0.0, 0.0]),
+    ],
+)
+def test_upward_normals_have_a_positive_z_then_y_then_x(estimated, upward, monkeypatch):
+    normals = np.array([estimated])
+    monkeypatch.setattr(module, "estimate_normals", lambda _: normals)
+
+    assert upward_normals(np.zeros((1, 3))).tolist() == [upward]

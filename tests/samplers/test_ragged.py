@@ -183,6 +183,7 @@ WRONG_BATCHES = {
     "batch size": (ONE, [0], r"shape \(P=20,\)"),
     "batch order": (ONE, [1] + [0] * 19, "ascending"),
     "batch below 0": (ONE, [-1] * 10 + [0] * 10, "at least 0"),
+    "batch without points": (ONE[:0], torch.zeros(0).long(), "points must have at least one cloud"),
     "batch gap": (ONE, [0] * 10 + [2] * 10, "cloud 1 has no points"),
 }
 

@@ -198,6 +198,13 @@ def test_label_smoothing_out_of_range_is_refused(share):
         Classification(PointNetVanilla(4), 4, label_smoothing=share)
 
 
+def test_net_that_is_no_module_is_refused():
+    no_net: Any = len
+
+    with pytest.raises(UserError, match=r"net must be a torch\.nn\.Module, got <built-in"):
+        Classification(no_net, 4)
+
+
 def test_net_of_another_task_is_refused():
     net = PointNetVanilla(4)
 

@@ -11,6 +11,7 @@ from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.records import run_record
 from mops_lightning.records.run_record import Evaluated
 from mops_lightning.training.evaluation import command_line
+from mops_lightning.training.run.load import _changed_settings
 from mops_lightning.training.run.run import run
 from mops_lightning.zoo import publish, weights
 from mops_lightning.zoo.load import load_net
@@ -240,3 +241,20 @@ def test_evaluate_missing_weights_raises(trained, tmp_path):
     (tmp_path / "result.json").write_text(json.dumps(record))
     with pytest.raises(UserError, match=r"evaluate: .* cannot be loaded"):
         evaluated((tmp_path, record), tmp_path, "weights=null")
+
+
+def test_settings_that_a_net_has_from_its_run_are_no_changed_settings():
+    recorded = {
+        "task.net.n_points": 1024,
+        "task.net.k": 16,
+        "task.net.sampler.m": 32,
+        "task.net.sampler.m_max": 512,
+        "task.net.sampler.seed": 0,
+        "task.net.sampler.alpha": 30.0,
+    }
+    of_stages = {"m": 8, "m_max": 64, "seed": 5, "alpha": 1.0}
+    net = {"n_points": 256, "k": 8, "sampler": of_stages}
+
+    different = _changed_settings(recorded, net)
+
+    assert different == ["task.net.k=16", "task.net.sampler.alpha=30.0"]
