@@ -26,8 +26,9 @@ def two_stage_net(sampler):
 
 def seven_channels(k, **settings):
     """Return a stage that keeps 5 points and gathers k neighbours, and its sampler."""
-    sampler = StageMOPSNet(5, 7, tau_min=1.0, anchor_width=3.0, **settings)
+    sampler = StageMOPSNet(5, 7, tau_min=1.0, **settings)
     net = moved(sampler).eval()
+    torch.nn.init.constant_(net.queries.log_width, 2.0)  # points away from their anchors
     stage = Stage(net, 5, channels_in=7, channels_out=9, k=k)
     return net, stage.eval()
 
@@ -160,7 +161,9 @@ def test_stage_gathers_the_points_nearest_to_the_anchors(k, randn):
     anchors = gather_points(points, anchor_rows)
     assert not torch.equal(centres, anchors)
     in_order = torch.cdist(anchors, points).argsort(2)
+    from_centres = torch.cdist(centres, points).argsort(2)
     assert rows.equal(in_order[..., :k])
+    assert not rows.equal(from_centres[..., :k])
 
 
 @pytest.mark.parametrize(
