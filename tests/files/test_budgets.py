@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mops_lightning.filesystem import TEMPORARY
 from tests.support.cloud_files import contents, write_cloud
 from tests.support.downsample import call, done, refused
 
@@ -267,97 +266,3 @@ def test_map_of_another_command_is_not_replaced(clouds, tmp_path):
     assert path.read_bytes() == b"mine"
     assert not target.exists()
     done(*command, "--overwrite")
-
-
-def test_chunk_of_all_points_draws_none(clouds, tmp_path):
-    options = ["--method", "random", "--m", 60, "--chunk"]
-
-    of_all = done(clouds / "a.ply", tmp_path / "all.ply", *options, 600)
-    of_few = done(clouds / "a.ply", tmp_path / "few.ply", *options, 599)
-
-    assert "60 of 600 points, " in of_all
-    assert "chosen among" not in of_all
-    assert "chosen among 599 that were drawn at random (--chunk)" in of_few
-
-
-@pytest.mark.parametrize("extra", [[], ["--chunk", 900]])
-def test_stratify_keeps_the_order_of_the_file(extra, clouds, tmp_path):
-    options = ["--method", "random", "--m", 60, "--stratify", "class:min=20", *extra]
-
-    done(clouds / "a.ply", tmp_path / "out.ply", *options)
-
-    kept = contents(tmp_path / "out.ply")
-    rows = kept.columns["row"].tolist()
-    assert rows == sorted(rows)
-    assert classes_of(tmp_path / "out.ply") == {1: 38, 4: 20, 9: 2}
-
-
-def test_stratify_with_a_chunk_of_m_draws_as_many_of_every_class_as_it_keeps(clouds, tmp_path):
-    options = ["--method", "random", "--m", 60, "--stratify", "class:min=20", "--chunk", 60]
-
-    done(clouds / "a.ply", tmp_path / "out.ply", *options)
-
-    assert classes_of(tmp_path / "out.ply") == {1: 38, 4: 20, 9: 2}
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (["--m", "50%", "--chunk", 100], "--chunk must be at least --m 300, got 100"),
-        (
-            ["--m", "50%", "--chunk", 100, "--stratify", "class:share"],
-            "--chunk must be at least --m 300, got 100",
-        ),
-        (
-            ["--m", 601, "--chunk", 900, "--stratify", "class:share"],
-            "holds 600 points, fewer than --m 601",
-        ),
-        (["--m", 601, "--chunk", 900], "holds 600 points, fewer than --m 601"),
-    ],
-)
-def test_more_points_than_are_drawn_are_refused(options, said, clouds, tmp_path):
-    words = refused(clouds / "a.ply", tmp_path / "out.ply", "--method", "random", *options)
-
-    assert said in words
-
-
-@pytest.mark.parametrize("method", ["fps", "poisson"])
-def test_space_of_columns_too_large_for_distances_is_refused(method, tmp_path):
-    source = tmp_path / "in.ply"
-    write_cloud(source, RNG.normal(size=(20, 3)), {"heat": np.full(20, 1e200)})
-    options = ["--method", method, "--m", 5, "--space", "heat"]
-
-    words = refused(source, tmp_path / "out.ply", *options)
-
-    assert "its coordinates are too large for float64 distances" in words
-
-
-@pytest.mark.parametrize(
-    ("options", "reason"),
-    [
-        (["--m", "10%"], "a share needs"),
-        (["--m", 16, "--stratify", "class:share"], "classes need"),
-        (["--m", 16, "--tile", 64], "tiles need"),
-        (["--m", "10%", "--tile", 64], "tiles need"),
-    ],
-)
-def test_sampler_of_one_size_is_refused_with_the_reason(options, reason, clouds, tmp_path):
-    weights = ["--weights", "mops.modelnet40-m16"]
-
-    words = refused(clouds / "a.ply", tmp_path / "out.ply", *weights, *options)
-
-    assert f"--weights: {reason} a sampler of every size, such as FMOPS-Net" in words
-    assert "mops.modelnet40-m16 is a MOPSNet for 16 points" in words
-
-
-def test_what_a_killed_run_left_beside_the_output_is_removed(clouds, tmp_path):
-    left = tmp_path / f"{TEMPORARY}out-x.ply"
-    below = tmp_path / "below" / f"{TEMPORARY}out-x.ply"
-    below.parent.mkdir()
-    for path in (left, below):
-        path.write_bytes(b"half")
-
-    done(clouds / "c.ply", tmp_path / "out.ply", "--method", "random", "--m", 5)
-
-    assert not left.exists()
-    assert below.exists()  # of another folder, where another run may write

@@ -7,6 +7,7 @@ import pytest
 from torch import nn
 
 from mops_lightning.data.formats.area import Area
+from mops_lightning.errors import UserError
 from mops_lightning.files import cli, downsample_cli
 from mops_lightning.files.arguments import parsed
 from mops_lightning.files.icp.cli import _fill_defaults
@@ -117,6 +118,9 @@ def test_compare_measures_coverage_by_default():
     }
 
 
+LEAST = {"draws": 1, "motions": 1, "crops": 1, "points": 20}
+
+
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
@@ -158,6 +162,18 @@ def test_compare_icp_fills_in_what_its_help_says(words, expected):
 
     found = {name: getattr(chosen, name) for name in expected}
     assert found == expected
+
+
+@pytest.mark.parametrize(("name", "least"), LEAST.items())
+def test_compare_icp_takes_the_least_numbers_and_none_below(name, least):
+    allowed = compare_arguments("--task", "icp", f"--{name}", str(least))
+    below = compare_arguments("--task", "icp", f"--{name}", str(least - 1))
+
+    _fill_defaults(allowed)
+
+    assert getattr(allowed, name) == least
+    with pytest.raises(UserError, match=f"--{name} must be at least {least}, got {least - 1}"):
+        _fill_defaults(below)
 
 
 def test_help_of_compare_names_the_defaults_of_icp():

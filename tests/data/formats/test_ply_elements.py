@@ -160,6 +160,21 @@ def test_polygons_of_any_number_of_corners_are_cut_into_triangles(count, form, t
     assert mesh.table.points.tolist() == [list(corner) for corner in corners]
 
 
+@pytest.mark.parametrize("count", ["char", "short", "int"])
+def test_list_of_fewer_than_no_corners_is_broken(count, tmp_path):
+    path = tmp_path / "a.ply"
+    lists = f"element face 2\nproperty list {count} uchar vertex_indices\n"
+    text = head("binary_little_endian", "element vertex 3\n", AXES, lists)
+    letter, _ = TYPES[count]
+    content = struct.pack("<9f", 0, 0, 0, 1, 0, 0, 0, 1, 0)
+    content += struct.pack(f"<{letter}3B", 3, 0, 1, 2)
+    content += struct.pack(f"<{letter}", -1) + bytes(70_000)
+    path.write_bytes(text.encode() + content)
+
+    with pytest.raises(ValueError, match="says 2 rows of face, it has 1"):
+        parse_mesh(path.read_bytes(), path)
+
+
 def test_ascii_rows_that_are_missing_are_counted_in_their_element(tmp_path):
     path = tmp_path / "a.ply"
     text = head("ascii", *TWO_CLOUDS)
