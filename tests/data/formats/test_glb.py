@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from mops_lightning.data.formats.registry import read
+from mops_lightning.errors import UserError
 from tests.support.cloud_files import contents
 from tests.support.meshes import packed_glb, quantised_glb
 
@@ -102,3 +103,11 @@ def test_glb_textures_are_named_as_left_out(tmp_path):
     (tmp_path / "a.glb").write_bytes(packed_glb(tree, content[28 + length :]))
 
     assert contents(tmp_path / "a.glb").form.left_out == ("textures",)
+
+
+def test_glb_of_several_buffers_is_broken(tmp_path):
+    corners = [[1, 2, 3], [4, 5, 6], [-7, 8, 100]]
+    (tmp_path / "a.glb").write_bytes(glb_of_triangle(5120, corners, buffer_of_views=1))
+
+    with pytest.raises(UserError, match=r"a\.glb is broken: .*it has several buffers"):
+        contents(tmp_path / "a.glb")

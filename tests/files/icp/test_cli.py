@@ -130,6 +130,18 @@ def test_starts_are_those_of_the_seed_for_the_same_frames(tmp_path):
     assert found[0] != found[1]
 
 
+def test_columns_name_those_of_bin_scans(tmp_path):
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    room(399, 0).astype(np.float32).tofile(folder / "a.bin")  # 4,788 bytes: no rows of four
+
+    called("--task", "icp", folder, "--m", 10, "--draws", 1, "--crops", 1, "--points", 200,
+           "--methods", "random", "--registration", "gicp", "--columns", "x,y,z",
+           "--out", tmp_path / "out")  # fmt: skip
+
+    assert len(rows_of(tmp_path / "out")) == 2
+
+
 def test_frames_with_poses_are_aligned_to_the_true_motion(tmp_path, capsys):
     folder = tmp_path / "frames"
     out = tmp_path / "out"
