@@ -37,16 +37,6 @@ def test_numbers_give_columns_and_truth_values_tables(values, heads, tmp_path):
     assert of_settings == heads
 
 
-def test_joint_and_other_trainings_of_one_net_share_no_table(tmp_path):
-    scores = {"test/generated/accuracy": 0.5}
-    put(tmp_path / "a", "mops", 32, scores, evaluated=evaluated(learn="joint"))
-    put(tmp_path / "b", "mops", 32, scores)
-
-    heads = [row for row in rows(table(tmp_path)) if row[0] == "sampled by"]
-
-    assert len(heads) == 2
-
-
 def test_means_of_full_clouds_by_net_count_equal_figures_once(tmp_path):
     """Three runs of one data set, and one of another seed's."""
     for name, net, weights, full in (

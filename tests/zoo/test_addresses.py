@@ -83,3 +83,11 @@ def test_missing_file_names_address_and_answer():
 def test_address_without_hash_or_model_is_refused(address, message):
     with pytest.raises(UserError, match=message):
         load(address)
+
+
+def test_address_may_have_a_query_behind_the_name():
+    url = f"https://example.org/a/{NAME}?download=true"
+
+    address = addresses.parse(f"{url}#sha256={DIGEST}")
+
+    assert address == (url, NAME, DIGEST)

@@ -58,3 +58,35 @@ def test_find_refuses_other_weights():
     assert names.find_model(f"nothing.here@sha256:{SHA256}") is None
     with pytest.raises(UserError, match=f"now has other weights than those with sha256 {SHA256}"):
         names.find_model(names.pinned("pointnet.modelnet40", SHA256))
+
+
+@pytest.mark.parametrize(
+    ("text", "is_name"),
+    [
+        ("fmops.chairs-m64", True),
+        ("a.b", True),
+        ("a.b.c_1", True),
+        ("a", False),
+        ("A.b", False),
+        ("a.", False),
+        ("a.pt", False),
+        ("a.json", False),
+        (f"a.{'b' * 98}", True),
+        (f"a.{'b' * 99}", False),
+    ],
+)
+def test_names_of_models_are_words_with_dots_of_up_to_100_letters(text, is_name):
+    assert names.is_name(text) == is_name
+
+
+def test_file_is_found_without_its_suffix_and_folders_below_home(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv(names.VARIABLE, "~/models")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "models").mkdir()
+    (tmp_path / "models" / "fmops.mine.safetensors").touch()
+    (tmp_path / "net.safetensors").touch()
+
+    assert str(names.resolve("net")) == "net.safetensors"
+    assert names.find_model("fmops.mine") == tmp_path / "models" / "fmops.mine.safetensors"
+    assert names.resolve("~/net.safetensors") == tmp_path / "net.safetensors"

@@ -4,11 +4,15 @@ import pytest
 import torch
 
 from mops_lightning import load
+from mops_lightning.channels import Channel, PointChannels
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.zoo import model_file, names, publish, weights
 from tests.support.models import rewrite, write_run
 from tests.support.records import record
+
+OF_TASK_NET = {"metrics": {"test/full/accuracy": 0.5}, "score_name": "test/full/accuracy"}
+"""Fields of the record of a task net."""
 
 
 @pytest.fixture
@@ -154,3 +158,47 @@ def test_record_that_names_a_model_gives_its_weights(run, tmp_path, monkeypatch)
     rewrite(path, {"queries.weight": torch.ones(16, 128)})
     with pytest.raises(UserError, match="now has other weights"):
         weights.of_run(run)
+
+
+def test_nets_of_a_sweep_become_models_task_nets_first(tmp_path):
+    sweep = tmp_path / "My Sweep"
+    write_run(sweep / "b" / "Net M8")
+    write_run(sweep / "a-joint", learn="joint")
+    write_run(sweep / "z-net", learn="task", **OF_TASK_NET)
+    write_run(sweep / "failed", status="failed")
+    runs = [sweep / name for name in ("b/Net M8", "failed", "a-joint", "z-net")]
+
+    added = publish.add_all(runs, sweep, tmp_path / "models")
+
+    names_of_files = [path.stem for path in added]
+    assert names_of_files == ["my-sweep.z-net", "my-sweep.a-joint", "my-sweep.b-net-m8"]
+    assert "task_weights" not in files_on_card(added[1])  # a joint run has one of its own
+
+
+def test_card_has_the_channels_of_the_run(run, tmp_path):
+    content = weights.read(run / weights.FILE)
+    channels = PointChannels([Channel("intensity", 100.0, 50.0)])
+    net = load(run)
+    weights.save(run / weights.FILE, net, content["config"], {}, channels=channels)
+
+    card = model_file.read_card(publish.add(run, "fmops.mine", tmp_path))
+
+    assert card["channels"] == [["intensity", 100.0, 50.0]]
+    assert "channels" not in model_file.read_card(publish.add(other_run(tmp_path), "a.b", tmp_path))
+
+
+def other_run(folder):
+    write_run(folder / "other")
+    return folder / "other"
+
+
+@pytest.mark.parametrize(("entries", "precision"), [(4096, "float16"), (4095, "float32")])
+def test_matrices_of_4096_entries_and_more_are_rounded(entries, precision, run, tmp_path):
+    path = run / weights.FILE
+    config = weights.read(path)["config"]
+    net = torch.nn.Linear(entries, 1, bias=False)
+    weights.save(path, net, config, {})
+
+    card = model_file.read_card(publish.add(run, "fmops.mine", tmp_path, half=True))
+
+    assert card["precision"] == precision

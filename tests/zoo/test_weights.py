@@ -8,6 +8,7 @@ from mops_lightning.data.clouds import CloudDataset, Clouds
 from mops_lightning.errors import UserError
 from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.tasks.classification import Classification
+from mops_lightning.tasks.segmentation import Segmentation
 from mops_lightning.zoo import weights
 from mops_lightning.zoo.outputs import check_names
 from tests.support.models import rewrite
@@ -155,3 +156,59 @@ def test_joint_run_gives_its_task_net_and_another_run_what_it_trained(tmp_path):
 
     assert weights.of_task_net(joint) == joint / "task_weights.safetensors"
     assert weights.of_task_net(alone) == alone / weights.FILE
+
+
+@pytest.mark.parametrize(
+    ("state", "name"),
+    [
+        ({"a": torch.ones(2), "b": torch.tensor([1.0, float("nan")])}, "b"),
+        ({"a": {"b": [torch.ones(1), torch.tensor(float("inf"))]}}, "a.b.1"),
+        ({"a": ({"b": torch.tensor(float("nan"))},)}, "a.0.b"),
+        ({"a": {"b": [torch.ones(1)]}, "n": torch.tensor(3), "text": "nan", "f": 1.0}, None),
+    ],
+)
+def test_first_nonfinite_names_a_tensor_in_nested_data(state, name):
+    assert weights.first_nonfinite(state) == name
+
+
+def test_digest_depends_on_names_shapes_types_and_values_but_not_on_order():
+    state = {"a": torch.zeros(2, 3), "b": torch.ones(4)}
+    same = {"b": torch.ones(4), "a": torch.zeros(2, 3)}
+    others = [
+        {"a": torch.zeros(3, 2), "b": torch.ones(4)},
+        {"a": torch.zeros(2, 3), "c": torch.ones(4)},
+        {"a": torch.zeros(2, 3, dtype=torch.int32), "b": torch.ones(4)},
+        {"a": torch.zeros(2, 3), "b": torch.full((4,), 2.0)},
+        {"a": torch.zeros(2, 3)},
+    ]
+
+    digests = {weights.digest(other) for other in (state, *others)}
+
+    assert weights.digest(same) == weights.digest(state)
+    assert len(digests) == 6
+
+
+def test_truth_values_are_no_quantised_tensors(saved):
+    net, path = saved
+    net.register_buffer("mask", torch.tensor([True, False]))
+
+    weights.save(path, net, {}, {})
+
+    assert weights.read(path)["state"]["mask"].tolist() == [True, False]
+
+
+def test_parts_of_another_net_are_called_parts():
+    clouds = Clouds(torch.rand(2, 8, 3), torch.tensor([0, 1]))
+    dataset = CloudDataset(("a",), clouds, clouds, "", part_names=("x", "y"))
+    task = Segmentation(Shape(), 2)
+
+    check_names(["x", "y"], task, dataset, "net")
+    with pytest.raises(UserError, match="its net has 2 parts, which are not the 2 parts of the"):
+        check_names(["y", "x"], task, dataset, "net")
+    with pytest.raises(UserError, match="net does not name the parts of its net"):
+        check_names(None, task, dataset, "net")
+
+
+class Shape(nn.Module):
+    def forward(self, points):
+        return points[..., :2]
