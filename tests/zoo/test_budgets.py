@@ -275,33 +275,6 @@ def test_tile_keeps_m_points():
     assert len(set(rows.tolist())) == 40
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ({"spacing": 0}, "spacing must be a number above 0"),
-        ({"voxel": float("inf")}, "voxel must be a number above 0"),
-        ({"spacing": True}, "spacing must be a number above 0"),
-        ({"spacing": 1, "method": "random"}, "method needs m"),
-        ({"spacing": 1, "start": 3}, "start is for method='fps'"),
-        ({"spacing": 1, "readout": "generated"}, "spacing keeps input points"),
-        ({"spacing": 1, "readout": None}, "readout must be completed or generated"),
-        ({"m": 5, "readout": None}, "readout: unknown None"),
-        ({"m": 5, "method": ""}, "method: unknown ''"),
-        ({"m": 500}, "m must be at most the number of points N=200"),
-        ({"m": [5, 6]}, "m: 2 numbers for 1 clouds"),
-        ({"m": 5, "space": (1, 1)}, "space must hold a factor of at least 0 for each of the 3"),
-        ({"m": 5, "space": (1, 1, 1), "method": "random"}, "space is for method='fps'"),
-        ({"m": 5, "tile": 1}, "tile must be a whole number of at least 2"),
-        ({"voxel": 1e-20}, "voxel: 1e-20 is too small"),
-    ],
-)
-def test_mistakes_are_one_line(arguments, words):
-    with pytest.raises(UserError, match=words) as refused:
-        downsample(CLOUD, **arguments)
-
-    assert "\n" not in str(refused.value)
-
-
 def test_folder_without_weights_is_refused(tmp_path):
     with pytest.raises(UserError, match="holds no weights"):
         downsample(CLOUD, 5, tmp_path)
