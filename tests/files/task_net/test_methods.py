@@ -136,15 +136,15 @@ def test_sampler_sees_channels_scaled_as_in_its_own_training(rng):
     torch.manual_seed(0)
     sampler = FMOPSNet(16, point_channels=own).eval()
     sampler.queries.weight.data *= 100  # samples depend on the channels
-    places = normalize_unit_sphere(torch.rand(2, 60, 3, generator=rng))
-    intensity = 300 * torch.rand(2, 60, 1, generator=rng)
+    places = normalize_unit_sphere(torch.rand(4, 200, 3, generator=rng))
+    intensity = 3000 * torch.rand(4, 200, 1, generator=rng)
     clouds = torch.cat([places, (intensity - 10) / 5], 2)
 
-    rows = Trained(sampler, "mine", of_net).rows(clouds, 9, 0)
+    rows = Trained(sampler, "mine", of_net).rows(clouds, 16, 0)
 
     of_sampler = torch.cat([places, (intensity - 100) / 50], 2)
-    assert torch.equal(rows, rows_in_unit_sphere(sampler, of_sampler, 9))
-    assert not torch.equal(rows, rows_in_unit_sphere(sampler, clouds, 9))
+    assert torch.equal(rows, rows_in_unit_sphere(sampler, of_sampler, 16))
+    assert not torch.equal(rows, rows_in_unit_sphere(sampler, clouds, 16))
 
 
 def test_channels_of_two_samplers_are_those_that_one_of_them_has():
