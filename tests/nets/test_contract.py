@@ -171,6 +171,7 @@ INVALID: list[tuple[Callable[[], Any], str]] = [
     (lambda: HierarchicalNet(5, FPSSampler, (20, 8), (8, 16)), "one number more than the 2 of po"),
     (lambda: HierarchicalNet(5, FPSSampler, [8, 9], [8] * 3), r"points must not .*got \[8, 9\]"),
     (lambda: HierarchicalNet(5, FPSSampler, k=0), "k must be at least 1, got 0"),
+    (lambda: HierarchicalNet(5, FPSSampler, hidden=0), "hidden must be at least 1, got 0"),
 ]
 
 

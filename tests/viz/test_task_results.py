@@ -104,6 +104,7 @@ def test_pair_grid_says_angles_and_errors_of_every_pair(pairs):
         "rotation error 30.0°",
     ]
     assert titles_of(figure) == ["before (centred)", "by fps", "", ""]
+    assert figure.get_supxlabel() == "source blue, target orange, sampled points ringed"
 
 
 def test_pair_grid_frames_source_and_target(pairs):
