@@ -1,5 +1,6 @@
 """What the end of a sweep says and does."""
 
+import os
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -58,7 +59,8 @@ def test_end_of_a_sweep_counts_cells_by_state_and_says_how_to_repeat_the_rest(
 def test_end_of_a_sweep_counts_no_cells_of_an_earlier_start(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     sweep = tmp_path / "sweep"
-    cell_of(sweep, "old", status="interrupted")
+    cell = cell_of(sweep, "old", status="interrupted")
+    os.utime(cell / ".hydra" / "overrides.yaml", (1e9, 1e9))
     (sweep / BEGUN).touch()
 
     with pytest.raises(SystemExit):
