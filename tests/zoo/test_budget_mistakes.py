@@ -1,5 +1,6 @@
 """Arguments of ``downsample`` at their limits: refused, or equal to others."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -7,6 +8,8 @@ from mops_lightning import downsample
 from mops_lightning.errors import UserError
 
 CLOUD = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) * 7
+WIDE = torch.cat([CLOUD, CLOUD[:, :1]], 1)
+"""The same with a further column."""
 FEW = [1] * 4 + [0] * 196
 """Weights of four points."""
 
@@ -73,9 +76,41 @@ def test_space_of_the_coordinates_chooses_as_without_it_also_by_weights():
 def test_small_cloud_of_a_flat_batch_is_kept_whole():
     batch = torch.tensor([0] * 3 + [1] * 20)
 
-    kept, rows = downsample(CLOUD[:23], 5, batch=batch)
+    for points in (CLOUD[:23], WIDE[:23]):
+        kept, rows = downsample(points, 5, batch=batch)
 
-    assert len(kept) == 8
-    assert rows[:3].tolist() == [0, 1, 2]
-    assert (rows[3:] >= 3).all()
-    assert torch.equal(kept, CLOUD[rows])
+        assert len(kept) == 8
+        assert rows[:3].tolist() == [0, 1, 2]
+        assert (rows[3:] >= 3).all()
+        assert torch.equal(kept, points[rows])
+
+
+def test_whole_numbers_of_map_coordinates_are_not_rounded():
+    numbers = (100 * CLOUD).round().long()
+
+    _, rows = downsample(numbers, 9, start=0)
+    _, far_away = downsample(numbers + 2**30, 9, start=0)
+
+    assert far_away.tolist() == rows.tolist()
+
+
+def test_arrays_of_another_byte_order_give_the_same_rows():
+    array = CLOUD.numpy()
+
+    kept, rows = downsample(array, 9)
+    swapped, same = downsample(array.astype(">f4"), 9)
+
+    assert same.tolist() == rows.tolist()
+    assert np.array_equal(swapped, kept)
+
+
+def test_columns_and_rows_outside_of_the_cloud_are_refused():
+    with pytest.raises(UserError, match=r"points must have shape .* got \(200, 2\)"):
+        downsample(CLOUD[:, :2], 5)
+    with pytest.raises(UserError, match="start must be less than the number of points N=200"):
+        downsample(CLOUD.numpy(), 5, start=200)
+    unknown = WIDE.clone()
+    unknown[3, 3] = float("nan")
+    with pytest.raises(UserError, match="space: a column is not finite"):
+        downsample(unknown, 5, space=(1, 1, 1, 1))
+    assert len(downsample(unknown, 5, space=(1, 1, 1, 0))[0]) == 5
