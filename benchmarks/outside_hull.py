@@ -21,6 +21,7 @@ from torch import Tensor
 import mops_lightning
 from mops_lightning.data.hdf5 import read_lines
 from mops_lightning.ops.points import gather_points
+from mops_lightning.ops.readout import match
 from mops_lightning.zoo.load import load_net
 
 BATCH = 64
@@ -51,8 +52,8 @@ def report(name: str, net: torch.nn.Module, clouds: Tensor, labels: Tensor) -> N
     sampler = mops_lightning.load(name)
     with torch.no_grad():
         generated = torch.cat([sampler(batch).points for batch in clouds.split(BATCH)])
-    distances, rows = torch.cdist(generated, clouds).min(2)
-    matched = gather_points(clouds, rows)
+    matched = gather_points(clouds, match(generated, clouds))
+    distances = (generated - matched).norm(dim=2)
     is_outside = torch.stack([outside(*pair) for pair in zip(generated, clouds, strict=True)])
     moved = torch.where(is_outside[:, :, None], matched, generated)
     share = 100 * float(is_outside.float().mean())
