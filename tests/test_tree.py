@@ -12,7 +12,7 @@ from mops_lightning.zoo import model_file, names, weights
 
 ROOT = Path(__file__).parents[1]
 TREE = 40_000_000
-MODELS = 20_000_000
+MODELS = 30_000_000
 PICTURE = 300_000
 PICTURES = {".png", ".svg", ".jpg", ".jpeg", ".gif", ".webp"}
 WEIGHTS = {".pt", ".ckpt", ".safetensors", ".onnx"}
