@@ -253,9 +253,21 @@ def test_mixed_table_keeps_samplers_apart_that_would_share_a_cell(tmp_path):
         put(tmp_path / name, sampler, m, metrics, of={"alpha": alpha, "m": m})
 
     assert our_rows(table(tmp_path, mixed=True))[1:] == [
-        ["snet alpha=1.0", "", "5.00"],
-        ["snet alpha=10.0", "", "50.00"],
+        ["snet alpha=1", "", "5.00"],
+        ["snet alpha=10", "", "50.00"],
         ["mops", "50.00", "5.00"],
+    ]
+
+
+def test_a_whole_number_written_in_two_ways_gives_one_row(tmp_path):
+    """The defaults have alpha=30.0, and ``sampler.alpha=30`` on the command line an integer."""
+    for name, m, alpha in (("a", 8, 3), ("b", 8, 30.0), ("c", 32, 30)):
+        values = {"test/generated/accuracy": 0.5}
+        put(tmp_path / name, "mops", m, values, of={"alpha": alpha, "m": m})
+
+    assert our_rows(table(tmp_path, mixed=True))[1:] == [
+        ["mops alpha=3", "", "50.00"],
+        ["mops alpha=30", "50.00", "50.00"],
     ]
 
 

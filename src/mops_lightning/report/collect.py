@@ -181,3 +181,10 @@ def score(found: list[RunRecord]) -> str:
         if name is not None:
             return name.metric
     return ""
+
+
+def setting_text(value: Any) -> str:
+    """Return a setting as text; numbers that are equal give the same text, 30 for 30.0."""
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
+    return str(value)

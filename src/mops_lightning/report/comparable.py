@@ -12,7 +12,14 @@ from mops_lightning.config.shared_settings import table_settings, with_defaults
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.records.summary import OF_TEST_CLOUDS
 from mops_lightning.report import collect
-from mops_lightning.report.collect import epochs, recorded_recipe, sampler_row, seed, trained_with
+from mops_lightning.report.collect import (
+    epochs,
+    recorded_recipe,
+    sampler_row,
+    seed,
+    setting_text,
+    trained_with,
+)
 from mops_lightning.tree import dotted
 
 Row = tuple[str, str]
@@ -305,7 +312,7 @@ def varying(found: list[RunRecord]) -> list[str]:
         keys.update(of_run)
     different = []
     for key in keys:
-        texts = {_text(of_run.get(key)) for of_run in settings}
+        texts = {setting_text(of_run.get(key)) for of_run in settings}
         if len(texts) > 1:
             different.append(key)
     return sorted(different)
@@ -388,10 +395,3 @@ def _are_numbers(found: list[RunRecord], keys: list[str]) -> bool:
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _text(value: Any) -> str:
-    """Return a value as text; numbers that are equal give the same text."""
-    if type(value) is int:
-        value = float(value)
-    return repr(value)
