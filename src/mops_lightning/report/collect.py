@@ -183,8 +183,8 @@ def score(found: list[RunRecord]) -> str:
     return ""
 
 
-def setting_text(value: Any) -> str:
-    """Return a setting as text; numbers that are equal give the same text, 30 for 30.0."""
+def plain_number(value: Any) -> Any:
+    """Return a setting, whole numbers as integers, so that 30 and 30.0 give the same text."""
     if isinstance(value, float) and value.is_integer():
-        value = int(value)
-    return str(value)
+        return int(value)
+    return value
