@@ -46,10 +46,14 @@ class EdgeConvolution(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """Map ``(B, N, channels_in)`` to ``(B, N, channels_out)``."""
-        near = gather_points(features, feature_neighbours(features, self.k))
-        own = features[:, :, None].expand_as(near)
-        edges = torch.cat([own, near - own], 3)
-        return self.layers(edges.flatten(0, 2)).unflatten(0, edges.shape[:3]).amax(2)
+        linear, rest = self.layers[0], self.layers[1:]
+        of_own, of_difference = linear.weight.split(features.shape[2], 1)
+        # The first layer is linear: it is applied to every point once, not to every edge.
+        own = nn.functional.linear(features, of_own - of_difference)
+        neighbour = nn.functional.linear(features, of_difference)
+        near = gather_points(neighbour, feature_neighbours(features, self.k))
+        edges = own[:, :, None] + near
+        return rest(edges.flatten(0, 2)).unflatten(0, edges.shape[:3]).max(2).values
 
 
 class EdgeEmbedding(nn.Module):
@@ -110,11 +114,19 @@ class NeighbourAttention(nn.Module):
     def attend(self, features: Tensor) -> Tensor:
         """Return the attention ``(B, N, channels)`` of every point to its neighbours."""
         rows = feature_neighbours(features, self.k)
-        queries = self.queries(features).unflatten(2, (self.heads, -1))
+        n = features.shape[1]
+        near = torch.zeros(len(features), n, n, dtype=torch.bool, device=features.device)
+        near.scatter_(2, rows, True)
+        queries = self._by_head(self.queries(features))
         # The key of f_j − f_i differs from that of f_j by the same for all j: softmax cancels it.
-        keys = gather_points(self.keys(features), rows).unflatten(3, (self.heads, -1))
+        keys = self._by_head(self.keys(features))
         values = self.values(features)
-        near = gather_points(values, rows).unflatten(3, (self.heads, -1))
-        logits = torch.einsum("bnhd,bnkhd->bnhk", queries, keys) * queries.shape[-1] ** -0.5
-        mean = torch.einsum("bnhk,bnkhd->bnhd", logits.softmax(3), near)
-        return mean.flatten(2) - values
+        # All pairs with a mask take less time and memory than the gathered keys and values.
+        means = nn.functional.scaled_dot_product_attention(
+            queries, keys, self._by_head(values), attn_mask=near[:, None]
+        )
+        return means.transpose(1, 2).flatten(2) - values
+
+    def _by_head(self, features: Tensor) -> Tensor:
+        """Return ``(B, heads, N, C / heads)`` of ``(B, N, C)``."""
+        return features.unflatten(2, (self.heads, -1)).transpose(1, 2)

@@ -14,6 +14,8 @@ from .selector import straight_through
 
 STAGES = 2
 SMALL = 1e-8
+ROUNDING = 1e-4
+"""What a whole number of points may lack by rounding, whatever the order of the points."""
 
 
 def sparse_scores(attention: Tensor, rows: Tensor) -> Tensor:
@@ -56,7 +58,7 @@ def allot(weights: Tensor, available: Tensor, m: int) -> Tensor:
         share = share / share.sum(1, keepdim=True).clamp(min=1e-30)
         given = torch.minimum(given + share * left, available)
         share = torch.where(given >= available, 0.0, share)
-    counts = (given + SMALL).long()
+    counts = (given + ROUNDING).long()
     room = available.long() - counts
     for _ in range(share.shape[1]):
         missing = (m - counts.sum(1, keepdim=True)).clamp(0, 1)
