@@ -35,8 +35,8 @@ class EdgeConvolution(nn.Module):
     def __init__(self, channels_in: int, hidden: int, channels_out: int, k: int) -> None:
         super().__init__()
         self.k = k
-        self.layers = nn.Sequential(
-            nn.Linear(2 * channels_in, hidden, bias=False),
+        self.first = nn.Linear(2 * channels_in, hidden, bias=False)
+        self.rest = nn.Sequential(
             nn.BatchNorm1d(hidden),
             nn.LeakyReLU(SLOPE),
             nn.Linear(hidden, channels_out, bias=False),
@@ -46,14 +46,13 @@ class EdgeConvolution(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """Map ``(B, N, channels_in)`` to ``(B, N, channels_out)``."""
-        linear, rest = self.layers[0], self.layers[1:]
-        of_own, of_difference = linear.weight.split(features.shape[2], 1)
+        of_own, of_difference = self.first.weight.split(features.shape[2], 1)
         # The first layer is linear: it is applied to every point once, not to every edge.
         own = nn.functional.linear(features, of_own - of_difference)
         neighbour = nn.functional.linear(features, of_difference)
         near = gather_points(neighbour, feature_neighbours(features, self.k))
         edges = own[:, :, None] + near
-        return rest(edges.flatten(0, 2)).unflatten(0, edges.shape[:3]).max(2).values
+        return self.rest(edges.flatten(0, 2)).unflatten(0, edges.shape[:3]).max(2).values
 
 
 class EdgeEmbedding(nn.Module):

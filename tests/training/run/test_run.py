@@ -91,6 +91,25 @@ def test_completed_run_resumed_is_completed_with_the_cpu_time_of_all_parts(tmp_p
     assert again.seconds["fit_cpu"] > 1000
 
 
+def test_resumed_run_records_what_its_training_began_with(tmp_path):
+    job(tmp_path / "net", "learn=task", "+trainer.limit_train_batches=1")
+    net = f"weights={tmp_path / 'net'}"
+    first = job(tmp_path / "first", net)
+    path = tmp_path / "first" / "checkpoints" / CHECKPOINT
+
+    again = job(tmp_path / "again", net, f"ckpt_path={path}", "trainer.max_epochs=2")
+    path = tmp_path / "again" / "checkpoints" / CHECKPOINT
+    third = job(tmp_path / "third", net, f"ckpt_path={path}", "trainer.max_epochs=3")
+
+    assert first.weights_loaded
+    assert first.warm_start
+    assert first.partial == ["used a task net trained with trainer.limit_train_batches=1"]
+    for resumed in (again, third):
+        assert resumed.weights_loaded == first.weights_loaded
+        assert resumed.warm_start == first.warm_start
+        assert resumed.partial == first.partial
+
+
 @pytest.mark.parametrize(
     ("limits", "partial"),
     [

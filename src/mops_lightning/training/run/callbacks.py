@@ -2,6 +2,7 @@
 
 import sys
 import time
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from omegaconf import DictConfig
 from mops_lightning.config.build import build_as
 from mops_lightning.config.shortened import UNLIMITED
 from mops_lightning.errors import UserError
+from mops_lightning.records.run_record import RunRecord
 
 DEFAULT_CALLBACKS = ("learning_rate", "checkpoint", "progress", "pictures")
 """Names in ``conf/callbacks/default.yaml``. None of them changes the training."""
@@ -50,6 +52,37 @@ class CPUTime(Callback):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Continue from a checkpoint."""
         self.before = float(state_dict["seconds"])
+
+
+class KeepsStart(Callback):
+    """Keeps in checkpoints what a training began with, for the record of a resumed run.
+
+    A resumed run has its nets from the checkpoint: it loads no task net and starts no layers.
+    """
+
+    def __init__(self) -> None:
+        self.facts: dict[str, Any] = {}
+
+    def note(self, record: RunRecord) -> None:
+        """Take the facts from the record of a training that begins."""
+        self.facts = {
+            "weights_loaded": record.weights_loaded,
+            "warm_start": record.warm_start,
+            "partial": list(record.partial),
+        }
+
+    def fill(self, record: RunRecord) -> None:
+        """Write the facts to the record of a training, which may have begun in another run."""
+        for name, value in deepcopy(self.facts).items():
+            setattr(record, name, value)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what a checkpoint keeps."""
+        return dict(self.facts)
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take the facts of the resumed training."""
+        self.facts = dict(state_dict)
 
 
 class EpochLines(Callback):

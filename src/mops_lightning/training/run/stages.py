@@ -20,7 +20,7 @@ from mops_lightning.training.checkpoint import Checkpoint, Diverged, check_finit
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.recipe import Recipe
 from mops_lightning.training.recipe.warm_start import warm_start_sampler
-from mops_lightning.training.run.callbacks import CPUTime
+from mops_lightning.training.run.callbacks import CPUTime, KeepsStart
 from mops_lightning.training.run.ending import KeepsEnding
 from mops_lightning.training.run.load import load_weights
 from mops_lightning.training.run.loggers import finish_loggers, log_test
@@ -100,12 +100,15 @@ def fit(parts: Parts, record: RunRecord) -> None:
     validation = None
     if len(parts.held_out.labels) > 0:
         validation = parts.score_loader(parts.held_out)
+    start = callback_of(trainer, KeepsStart)
+    start.note(record)
     checkpoint = None
     if resumed is not None:
         checkpoint = resumed.path
         _warn_of_other_threads(resumed, trainer)
     with _interruptible():
         trainer.fit(experiment, loader, validation, ckpt_path=checkpoint)
+    start.fill(record)
     check_finite(dict(experiment.state_dict()), trainer.global_step, trainer.strategy)
     record.seconds["fit_cpu"] = round(callback_of(trainer, CPUTime).seconds, 3)
     note_training(trainer, len(loader), record)

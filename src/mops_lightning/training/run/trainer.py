@@ -18,7 +18,12 @@ from mops_lightning.errors import UserError
 from mops_lightning.training.checkpoint import CHECKPOINT
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.recipe.moving_average import MovingAverage
-from mops_lightning.training.run.callbacks import CPUTime, EpochLines, build_callbacks
+from mops_lightning.training.run.callbacks import (
+    CPUTime,
+    EpochLines,
+    KeepsStart,
+    build_callbacks,
+)
 from mops_lightning.training.run.checkpoint_io import AtomicCheckpointIO
 from mops_lightning.training.run.ending import (
     KeepsEnding,
@@ -79,6 +84,7 @@ def make_trainer(
         *_callbacks_of_settings(cfg, folder, dataset, experiment, logged=bool(logger)),
         _stop_callback(node, folder),
         CPUTime(),
+        KeepsStart(),
         KeepsEnding(),
     ]
     defaults = {
