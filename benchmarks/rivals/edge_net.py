@@ -22,6 +22,13 @@ def feature_neighbours(features: Tensor, k: int) -> Tensor:
         return distances.topk(min(k, features.shape[1]), largest=False).indices
 
 
+def neighbour_mask(rows: Tensor) -> Tensor:
+    """Return which points ``(B, N, N)`` are neighbours of each, from their rows ``(B, N, k)``."""
+    clouds, n, _ = rows.shape
+    mask = torch.zeros(clouds, n, n, dtype=torch.bool, device=rows.device)
+    return mask.scatter_(2, rows, True)
+
+
 class EdgeConvolution(nn.Module):
     """Two layers on [f_i, f_j − f_i] of every neighbour j, then the maximum over the neighbours.
 
@@ -112,10 +119,7 @@ class NeighbourAttention(nn.Module):
 
     def attend(self, features: Tensor) -> Tensor:
         """Return the attention ``(B, N, channels)`` of every point to its neighbours."""
-        rows = feature_neighbours(features, self.k)
-        n = features.shape[1]
-        near = torch.zeros(len(features), n, n, dtype=torch.bool, device=features.device)
-        near.scatter_(2, rows, True)
+        near = neighbour_mask(feature_neighbours(features, self.k))
         queries = self._by_head(self.queries(features))
         # The key of f_j − f_i differs from that of f_j by the same for all j: softmax cancels it.
         keys = self._by_head(self.keys(features))

@@ -9,13 +9,13 @@ from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.ordering import point_hashes
 from mops_lightning.types import SampleOutput
 
-from .edge_net import EdgeEmbedding, NeighbourAttention, feature_neighbours
+from .edge_net import EdgeEmbedding, NeighbourAttention, feature_neighbours, neighbour_mask
 from .selector import straight_through
 
 STAGES = 2
 SMALL = 1e-8
 ROUNDING = 1e-4
-"""What a whole number of points may lack by rounding, whatever the order of the points."""
+"""A number this close below a whole one is whole: rounding depends on the order of the points."""
 
 
 def sparse_scores(attention: Tensor, rows: Tensor) -> Tensor:
@@ -31,7 +31,7 @@ def sparse_scores(attention: Tensor, rows: Tensor) -> Tensor:
     Returns:
         ``(B, N)``.
     """
-    mask = torch.zeros_like(attention).scatter_(2, rows, 1.0)
+    mask = neighbour_mask(rows).to(attention)
     return (attention * mask).sum(1) / mask.sum(1).clamp(min=1).square()
 
 
