@@ -188,3 +188,8 @@ def plain_number(value: Any) -> Any:
     if isinstance(value, float) and value.is_integer():
         return int(value)
     return value
+
+
+def text_to_compare(value: Any) -> str:
+    """Return a text that two settings share if they are equal: ``None`` and ``'None'`` are not."""
+    return repr(plain_number(value))

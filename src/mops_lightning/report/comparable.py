@@ -14,10 +14,10 @@ from mops_lightning.records.summary import OF_TEST_CLOUDS
 from mops_lightning.report import collect
 from mops_lightning.report.collect import (
     epochs,
-    plain_number,
     recorded_recipe,
     sampler_row,
     seed,
+    text_to_compare,
     trained_with,
 )
 from mops_lightning.tree import dotted
@@ -312,7 +312,7 @@ def varying(found: list[RunRecord]) -> list[str]:
         keys.update(of_run)
     different = []
     for key in keys:
-        texts = {repr(plain_number(of_run.get(key))) for of_run in settings}
+        texts = {text_to_compare(of_run.get(key)) for of_run in settings}
         if len(texts) > 1:
             different.append(key)
     return sorted(different)

@@ -105,7 +105,7 @@ def _telling_apart(records: Sequence[RunRecord], columns: Sequence[str]) -> list
     cells: dict[Any, list[dict[str, Any]]] = defaultdict(list)
     for record in records:
         settings = dotted(record.config["sampler"])
-        place = tuple(repr(collect.plain_number(settings.get(key))) for key in own)
+        place = tuple(collect.text_to_compare(settings.get(key)) for key in own)
         for m in _sizes(record):
             cells[place, m].append(settings)
     different: set[str] = set()
@@ -121,7 +121,7 @@ def _different(several: Sequence[dict[str, Any]]) -> set[str]:
         keys.update(settings)
     different = set()
     for key in keys:
-        values = {repr(collect.plain_number(settings.get(key))) for settings in several}
+        values = {collect.text_to_compare(settings.get(key)) for settings in several}
         if len(values) > 1:
             different.add(key)
     return different

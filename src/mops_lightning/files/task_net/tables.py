@@ -113,7 +113,7 @@ class Comparison:
         sizes = [m for m in frame.m.unique() if m]
         draws = frame.draw.nunique()
         clouds = frame.clouds.iloc[0]
-        draws_of_clouds = f"{counted(draws, 'draw')} of {clouds:,} clouds"
+        draws_of_clouds = f"{counted(draws, 'draw')} of {counted(clouds, 'cloud')}"
         files = counted(self.files, "file")
         title = f"{metric.title} of {self.net}: {draws_of_clouds} from {files}"
         best = {m: _best(frame[frame.m == m], column, metric) for m in sizes}
