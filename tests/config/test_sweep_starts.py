@@ -60,14 +60,12 @@ SMALLER = {
     "hierarchical": ["task.net.points=[64,32,16,8]"],
     "segmentation": ["dataset.train_per_class=2", "dataset.test_per_class=1"],
     "noise": [
-        "evaluate=null",
         "learn=nothing",
         "sampler=serial",
         "dataset.train_per_class=2",
         "dataset.test_per_class=1",
     ],
     "corruptions": [
-        "evaluate=null",
         "learn=nothing",
         "sampler=serial",
         "dataset.train_per_class=2",
@@ -157,16 +155,6 @@ def test_sweep_runs_a_cell_from_the_command_line(name, roots, tmp_path):
 
     assert status == 0, out + err
     assert "1 cells: 1 completed" in out
-
-
-@pytest.mark.parametrize("name", ["noise", "corruptions"])
-def test_sweep_of_tests_wants_to_know_what_to_test(name, tmp_path):
-    """Without ``evaluate=RUN`` it would train a net of the default settings in every cell."""
-    status, _, err = call(["-m", "--config-name", name, f"out={tmp_path}/out"], tmp_path)
-
-    assert status == 2
-    assert "evaluate must be set: try evaluate=VALUE." in err
-    assert not list(tmp_path.rglob("result.json"))
 
 
 def _size(cell):

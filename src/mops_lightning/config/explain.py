@@ -5,11 +5,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import (
-    InterpolationResolutionError,
-    MissingMandatoryValue,
-    ValidationError,
-)
+from omegaconf.errors import InterpolationResolutionError, ValidationError
 from yaml import MarkedYAMLError  # type: ignore[import-untyped]
 
 from mops_lightning.config import settings
@@ -25,9 +21,6 @@ SET_IN_FULL = ("task", "dataset", "sampler")
 """Groups whose files set every argument of the package's classes that a user may set."""
 AUGMENTED = ("augment.task", "augment.sampler")
 """Settings of the class ``AUGMENTATION``, which may be null."""
-
-OF_SWEEP = "hydra.sweeper.params."
-"""Where a file of ``--config-name`` says what a sweep varies, or wants to be given."""
 
 NO_OVERRIDE = re.compile(r"Could not override '([^']*)")
 NOT_IN_STRUCT = re.compile(r"is not in struct\s+full_key: (\S+)")
@@ -76,9 +69,6 @@ def _from_kind(cause: BaseException, arguments: Sequence[str]) -> str | None:
 
     if isinstance(cause, ValidationError) and cause.full_key:
         return str(refusal(cause.full_key, cause.value))
-    if isinstance(cause, MissingMandatoryValue) and str(cause.full_key).startswith(OF_SWEEP):
-        name = str(cause.full_key).removeprefix(OF_SWEEP)
-        return f"{name} must be set: try {name}=VALUE."
     if isinstance(cause, InterpolationResolutionError) and _is_setting(cause.full_key):
         return f"{cause.full_key}: {str(cause).splitlines()[0]}."
     if isinstance(cause, MissingConfigException) and cause.missing_cfg_file:
