@@ -161,7 +161,7 @@ def test_values_within_two_deviations_of_the_best_are_level(tmp_path):
     assert "**1.15 ± 0.10**" in text
     assert "<u>1.5 ± 0.10</u>" in text
     assert "| 1.6 ± 0.10" in text
-    assert "those level with it, less than two standard deviations over seeds away" in text
+    assert "those level with it: less than two standard deviations over seeds away, or" in text
 
     for path in tmp_path.glob("*[12]"):
         shutil.rmtree(path)
@@ -223,6 +223,22 @@ def test_value_with_a_spread_of_its_own_is_level_with_a_best_of_one_seed(tmp_pat
 
     assert "| mops | **1** |" in text
     assert "| fmops | **1.15 ± 0.10** (n=3)" in text
+
+
+def test_value_is_level_with_the_best_where_a_worse_one_is(tmp_path):
+    """The third reaches the best by its own deviation, the second does not, but is better."""
+    for seed, value in enumerate((0.99, 1.0, 1.01)):
+        put_cell(tmp_path, f"mops{seed}", "mops", {"generated": value}, seed=seed)
+        put_cell(tmp_path, f"snet{seed}", "snet", {"generated": value + 0.1}, seed=seed)
+        put_cell(tmp_path, f"fmops{seed}", "fmops", {"generated": 12 * value - 10.8}, seed=seed)
+    put_cell(tmp_path, "samplenet", "samplenet", {"generated": 1.3})
+
+    text = table(tmp_path)
+
+    assert "| mops | **1 ± 0.01** (n=3)" in text
+    assert "| snet | **1.1 ± 0.01** (n=3)" in text
+    assert "| fmops | **1.2 ± 0.12** (n=3)" in text
+    assert "| samplenet | <u>1.3</u> |" in text
 
 
 def test_nets_for_different_largest_sizes_have_rows_of_their_own(tmp_path):

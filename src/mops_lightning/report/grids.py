@@ -47,8 +47,8 @@ def _level_line(table: Table) -> list[str]:
     if not table.values["level"].any():
         return []
     return [
-        "Bold: the best value, and those level with it, less than two standard deviations over "
-        "seeds away."
+        "Bold: the best value, and those level with it: less than two standard deviations over "
+        "seeds away, or better than such a value."
     ]
 
 

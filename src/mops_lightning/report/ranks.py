@@ -15,7 +15,8 @@ def ranked(table: pd.DataFrame, metric: MetricInfo) -> pd.DataFrame:
 
     Points chosen from the input compete with completed sets, projected points with generated
     ones. Equal texts have equal ranks. A value is level with the best, and has its rank, if it is
-    less than two standard deviations away: the larger of the two deviations over seeds.
+    less than two standard deviations away, the larger of the two deviations over seeds, or if it is
+    better than such a value: a large deviation alone puts no value before a better one.
 
     Args:
         table: a row for every cell and readout: ``row``, ``m``, ``column``, ``down``, ``readout``,
@@ -26,9 +27,9 @@ def ranked(table: pd.DataFrame, metric: MetricInfo) -> pd.DataFrame:
     table["level"] = False
     if metric.higher_is_better is None:
         return table
-    best_of = "min"
+    best_of, worst_of = "min", "max"
     if metric.higher_is_better:
-        best_of = "max"
+        best_of, worst_of = "max", "min"
     readouts = table["readout"].replace({INDEX_READOUT: COMPLETED, PROJECTED: GENERATED})
     competition = [readouts, table["m"], table["column"], table["down"]]
     shown = pd.to_numeric(table["mean"].map(metric.format))
@@ -38,11 +39,13 @@ def ranked(table: pd.DataFrame, metric: MetricInfo) -> pd.DataFrame:
     deviations_of_best = deviation.where(is_best)
     deviation_of_best = deviations_of_best.groupby(competition).transform("max")
     reach = LEVEL * np.maximum(deviation, deviation_of_best)
-    is_near = (shown - best).abs() < reach
-    others = shown.where(~is_best & ~is_near)
+    is_near = is_best | ((shown - best).abs() < reach)
+    worst_near = shown.where(is_near).groupby(competition).transform(worst_of)
+    is_near |= (shown - best).abs() <= (worst_near - best).abs()
+    others = shown.where(~is_near)
     second = others.groupby(competition).transform(best_of)
     has_rivals = shown.groupby(competition).transform("count") > 1
     table["level"] = has_rivals & is_near & ~is_best
     table.loc[has_rivals & (shown == second), "rank"] = 2
-    table.loc[has_rivals & (is_best | is_near), "rank"] = 1
+    table.loc[has_rivals & is_near, "rank"] = 1
     return table
