@@ -60,8 +60,12 @@ def test_changed_copy_in_cache_is_downloaded_again(cache):
 
 
 def test_file_with_another_hash_is_refused_and_not_kept(cache):
-    with served(names.SHIPPED) as (url, _), pytest.raises(UserError, match="hash"):
-        load(f"{url}/{NAME}#sha256={'0' * 64}")
+    wanted = "0" * 64
+    with (
+        served(names.SHIPPED) as (url, _),
+        pytest.raises(UserError, match=f"hash.*{wanted}.*{DIGEST}"),
+    ):
+        load(f"{url}/{NAME}#sha256={wanted}")
 
     assert not [path for path in cache.rglob("*") if path.is_file()]
 
@@ -91,3 +95,9 @@ def test_address_may_have_a_query_behind_the_name():
     address = addresses.parse(f"{url}#sha256={DIGEST}")
 
     assert address == (url, NAME, DIGEST)
+
+
+def test_hash_may_be_in_capitals():
+    url = f"https://example.org/{NAME}"
+
+    assert addresses.parse(f"{url}#sha256={DIGEST.upper()}") == (url, NAME, DIGEST)

@@ -51,13 +51,13 @@ def parse(text: str) -> Address:
         raise UserError(
             f"{url}: a model's file ends in {model_file.SUFFIX}. Give an address like {EXAMPLE}"
         )
-    if not re.fullmatch("[0-9a-f]{64}", sha256):
+    if not re.fullmatch("[0-9a-fA-F]{64}", sha256):
         given = f"got {sha256!r:.80}" if sha256 else "got none"
         raise UserError(
             f"{url}: the address of a model must end in {HASH} and the 64 hexadecimal digits that "
             f"sha256sum prints for the file, {given}. They pin the weights: ask the publisher."
         )
-    return Address(url, name, sha256)
+    return Address(url, name, sha256.lower())
 
 
 def fetch(text: str) -> Path:
@@ -77,6 +77,9 @@ def fetch(text: str) -> Path:
     known = f"sha256:{address.sha256}"
     try:
         path = pooch.retrieve(address.url, known, address.name, folder, downloader=downloader)
-    except (OSError, ValueError, HTTPException) as error:  # ValueError: another hash
+    except (OSError, HTTPException) as error:
         raise UserError(f"{address.url}: {one_line(error)}") from None
+    except ValueError as error:  # the file has another hash; both are in the message
+        message = " ".join(str(error).split())
+        raise UserError(f"{address.url}: {message}") from None
     return Path(path)
