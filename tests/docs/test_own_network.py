@@ -35,7 +35,7 @@ def run_example(tmp_path, monkeypatch):
 
 
 def test_plain_loop_trains_a_sampler_for_the_net(run_example):
-    names = run_example("03_own_network.py", "60")
+    names = run_example("03_own_network.py", "100")
     net = names["net"]
     torch.manual_seed(1)
     points, labels = names["boxes"](200)
