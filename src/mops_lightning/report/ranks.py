@@ -27,9 +27,9 @@ def ranked(table: pd.DataFrame, metric: MetricInfo) -> pd.DataFrame:
     table["level"] = False
     if metric.higher_is_better is None:
         return table
-    best_of, worst_of = "min", "max"
+    best_of = "min"
     if metric.higher_is_better:
-        best_of, worst_of = "max", "min"
+        best_of = "max"
     readouts = table["readout"].replace({INDEX_READOUT: COMPLETED, PROJECTED: GENERATED})
     competition = [readouts, table["m"], table["column"], table["down"]]
     shown = pd.to_numeric(table["mean"].map(metric.format))
@@ -39,9 +39,9 @@ def ranked(table: pd.DataFrame, metric: MetricInfo) -> pd.DataFrame:
     deviations_of_best = deviation.where(is_best)
     deviation_of_best = deviations_of_best.groupby(competition).transform("max")
     reach = LEVEL * np.maximum(deviation, deviation_of_best)
-    is_near = is_best | ((shown - best).abs() < reach)
-    worst_near = shown.where(is_near).groupby(competition).transform(worst_of)
-    is_near |= (shown - best).abs() <= (worst_near - best).abs()
+    away = (shown - best).abs()
+    within_reach = away.where(is_best | (away < reach))
+    is_near = away <= within_reach.groupby(competition).transform("max")
     others = shown.where(~is_near)
     second = others.groupby(competition).transform(best_of)
     has_rivals = shown.groupby(competition).transform("count") > 1
