@@ -29,7 +29,7 @@ def test_export_of_a_model_writes_a_file_that_runs_at_any_size(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["mops.modelnet", "net.onnx"], "Did you mean 'mops.modelnet40-m8'"),
+        (["mops.modelnet", "net.onnx"], "Did you mean 'mops.modelnet40-m32'"),
         (["pointnet.modelnet40", "net.onnx"], "holds a task net"),
         (["mops.modelnet40-m32", "net.txt"], "OUT must end in .onnx or .pt2"),
         (["mops.modelnet40-m32", "net.onnx", "--m", 31], "m must be 32"),

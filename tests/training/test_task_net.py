@@ -24,10 +24,10 @@ def test_model_of_a_task_net_gives_its_task():
 
 
 def test_model_of_a_sampler_gives_the_task_net_it_was_trained_for():
-    trained = read_task("mops.modelnet40-m8")
+    trained = read_task("mops.modelnet40-m8-seed0")
 
     assert trained.sampler is not None
-    assert trained.sampler.name == "mops.modelnet40-m8.safetensors"
+    assert trained.sampler.name == "mops.modelnet40-m8-seed0.safetensors"
     assert type(trained.task.net).__name__ == "PointNetVanilla"
 
 

@@ -10,7 +10,7 @@ from mops_lightning.errors import UserError
 from mops_lightning.zoo import addresses, names, weights
 from tests.support.served import served
 
-NAME = "mops.modelnet40-m8.safetensors"
+NAME = "mops.modelnet40-m8-seed0.safetensors"
 FILE = names.SHIPPED / NAME
 DIGEST = sha256(FILE.read_bytes()).hexdigest()
 
