@@ -157,6 +157,19 @@ def test_sweep_runs_a_cell_from_the_command_line(name, roots, tmp_path):
     assert "1 cells: 1 completed" in out
 
 
+@pytest.mark.parametrize(
+    ("name", "one"), [("noise", "test_noise_std=0.01"), ("corruptions", "test_corruption=jitter-1")]
+)
+def test_sweep_of_tests_runs_with_its_own_params(name, one, roots, tmp_path):
+    """Hydra reads the params of the file before the command line, so these must be complete."""
+    sweep = ["-m", "--config-name", name, *settings_of(name, roots), one, f"out={tmp_path}/out"]
+
+    status, out, err = call(sweep, tmp_path)
+
+    assert status == 0, out + err
+    assert "1 cells: 1 completed" in out
+
+
 def _size(cell):
     """Return the number of points of a cell, which its cost depends on."""
     sizes = [int(one.partition("=")[2]) for one in cell if re.fullmatch(r"m=\d+", one)]
