@@ -186,7 +186,7 @@ def test_models_shows_every_fact_of_a_card(tmp_path):
 
 def test_models_shows_channels_classes_and_precision(tmp_path):
     write_run(tmp_path / "run")
-    path = publish.add(tmp_path / "run", "fmops.mine", tmp_path, half=True)
+    path = publish.add(tmp_path / "run", "fmops.mine", tmp_path, precision="float16")
     record = model_file.read_card(path)["record"]
     record["config"] |= {"learn": "task", "dataset": {"classes": ["chair", "vase"]}}
     channels = [["intensity", 0.0, 1.0], ["time", 0.0, 1.0]]

@@ -2,6 +2,7 @@ from typing import Any
 
 import pytest
 import torch
+from safetensors.torch import load_file
 
 from mops_lightning import load
 from mops_lightning.channels import Channel, PointChannels
@@ -91,17 +92,21 @@ def test_task_net_is_found_by_hash_or_name(run, tmp_path):
     assert weights.of_run(model, "task_weights") == task_net
 
 
-def test_half_precision_is_for_wide_layers(run, tmp_path):
-    path = publish.add(run, "fmops.half", tmp_path, half=True, notes="Mine.")
+@pytest.mark.parametrize(("precision", "bits"), [("float16", 16), ("bfloat16", 16), ("int8", 8)])
+def test_wide_layers_are_rounded(precision, bits, run, tmp_path):
+    path = publish.add(run, "fmops.small", tmp_path, precision=precision, notes="Mine.")
 
     card = model_file.read_card(path)
-    assert card["precision"] == "float16"
-    assert card["notes"] == f"Mine. {publish.ROUNDED}"
-    state = weights.read(path)["state"]
-    assert state["rho_local.weight"].dtype == torch.float16
-    assert state["queries.weight"].dtype == torch.float32  # 2,048 entries
+    assert card["precision"] == precision
+    before = "The test figures are those before wide layers were rounded"
+    assert card["notes"] == f"Mine. {before} to {bits} bits."
+    stored = load_file(path)
+    assert str(stored["rho_local.weight"].dtype) == f"torch.{precision}"
+    assert stored["queries.weight"].dtype == torch.float32  # 2,048 entries
+    given = weights.read(run / weights.FILE)["state"]["rho_local.weight"]
     sampler: Any = load(path)
     assert sampler.rho_local.weight.dtype == torch.float32
+    torch.testing.assert_close(sampler.rho_local.weight, given, rtol=0.004, atol=0.001)
 
 
 def test_shortened_run_is_no_model(run, tmp_path):
@@ -199,6 +204,6 @@ def test_matrices_of_4096_entries_and_more_are_rounded(entries, precision, run, 
     net = torch.nn.Linear(entries, 1, bias=False)
     weights.save(path, net, config, {})
 
-    card = model_file.read_card(publish.add(run, "fmops.mine", tmp_path, half=True))
+    card = model_file.read_card(publish.add(run, "fmops.mine", tmp_path, precision="float16"))
 
     assert card["precision"] == precision

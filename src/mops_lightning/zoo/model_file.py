@@ -28,6 +28,7 @@ LONGEST = 1 << 22
 
 SHA256 = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
 NAME_PATTERN = r"^[a-z0-9_-]+(\.[a-z0-9_-]+)+$"
+Precision = Literal["float32", "float16", "bfloat16", "int8"]
 NAME = Annotated[str, msgspec.Meta(pattern=NAME_PATTERN, max_length=100)]
 
 
@@ -86,7 +87,7 @@ class Card(msgspec.Struct, forbid_unknown_fields=True, tag_field="schema", tag=M
     name: NAME
     transform: Literal["unit_sphere"]
     licence: str
-    precision: Literal["float32", "float16", "bfloat16"]
+    precision: Precision
     notes: str
     figures: Figures
     record: dict[str, Any]

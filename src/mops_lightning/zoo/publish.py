@@ -5,18 +5,17 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor
-
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.records.metric_info import metric_info
 from mops_lightning.records.readout_names import FULL, ROWS, MetricName, parse_metric_name
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.zoo import model_file, names, weights
+from mops_lightning.zoo.model_file import Precision
+from mops_lightning.zoo.rounding import is_wide, rounded
 
-WIDE = 4096
-"""Weight matrices with this number of entries may be stored in 16 bits."""
-ROUNDED = "The test figures are those before wide layers were rounded to 16 bits."
+BITS = {"float16": 16, "bfloat16": 16, "int8": 8}
+ROUNDED = "The test figures are those before wide layers were rounded to {} bits."
 """Note of a model with rounded weights, since its figures are those of the run."""
 
 
@@ -26,7 +25,7 @@ def add(
     folder: Path,
     *,
     task_net: str | None = None,
-    half: bool = False,
+    precision: Precision = "float32",
     licence: str = "MIT",
     notes: str = "",
     overwrite: bool = False,
@@ -39,8 +38,8 @@ def add(
         folder: where ``NAME.safetensors`` is written.
         task_net: the model of a sampler's task net; None looks for the one that was used, in
             ``folder`` first.
-        half: store weight matrices with at least ``WIDE`` entries in float16; the card notes that
-            its figures are those before.
+        precision: of weight matrices with at least ``rounding.WIDE`` entries. The card's figures
+            are those before rounding, and its notes say so.
         licence: of the model.
         notes: what a user must know besides.
         overwrite: replace a model of this name.
@@ -55,10 +54,11 @@ def add(
     record = _whole_record(run)
     content = weights.read(weights.of_run(run))
     state = content["state"]
-    precision = "float32"
-    if half and _rounds_wide(state):
-        precision = "float16"
-        notes = f"{notes} {ROUNDED}".lstrip()
+    if not any(is_wide(value) for value in state.values()):
+        precision = "float32"
+    if precision != "float32":
+        state = rounded(state, precision)
+        notes = f"{notes} {ROUNDED.format(BITS[precision])}".lstrip()
     files = {"weights": name}
     if record.config["learn"] == "sampler":
         used = _task_net(task_net, record, folder)
@@ -117,17 +117,6 @@ def _whole_record(run: Path) -> RunRecord:
 
 def _has_weights(record: RunRecord) -> bool:
     return record.status == "completed" and "weights" in record.files
-
-
-def _rounds_wide(state: dict[str, Tensor]) -> bool:
-    """Round the wide weight matrices to 16 bits; whether there are any."""
-    wide = []
-    for name, value in state.items():
-        if value.ndim == 2 and value.numel() >= WIDE:
-            wide.append(name)
-    for name in wide:
-        state[name] = state[name].half()
-    return bool(wide)
 
 
 def add_all(runs: Iterable[Path], sweep: Path, folder: Path) -> list[Path]:

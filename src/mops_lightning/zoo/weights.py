@@ -17,6 +17,7 @@ from mops_lightning.zoo import model_file, names
 from mops_lightning.zoo.model_file import Damaged as Damaged
 from mops_lightning.zoo.model_file import damaged as damaged
 from mops_lightning.zoo.model_file import digest as digest
+from mops_lightning.zoo.rounding import restored
 
 FILE = f"weights{model_file.SUFFIX}"
 OTHER_NET = "Check task, task/net, samplers inside it and dataset.classes, or use weights=auto."
@@ -63,7 +64,7 @@ def read(path: str | Path) -> dict[str, Any]:
 
     Returns:
         ``config``, ``metrics``, ``classes``, ``channels``, ``sha256``, and ``state``, the tensors
-        by name.
+        by name; matrices that ``rounding`` wrote in 8 bits are float32.
 
     Raises:
         UserError: the file is missing, or may not be read.
@@ -77,6 +78,7 @@ def read(path: str | Path) -> dict[str, Any]:
         raise damaged(path) from None
     if digest(state) != header["sha256"]:
         raise damaged(path, "sha256 differs")
+    state = restored(state)
     for name, value in state.items():
         if value.element_size() == 1 and value.dtype != torch.bool:
             raise Damaged(f"{path}: {name} is quantised ({value.dtype}). Give it in 16 or 32 bits.")
