@@ -100,12 +100,12 @@ def test_space_of_columns_too_large_for_distances_is_refused(method, tmp_path):
     ],
 )
 def test_sampler_of_one_size_is_refused_with_the_reason(options, reason, cloud, tmp_path):
-    weights = ["--weights", "mops.modelnet40-m16"]
+    weights = ["--weights", "mops.modelnet40-m16-seed0"]
 
     words = refused(cloud, tmp_path / "out.ply", *weights, *options)
 
     assert f"--weights: {reason} a sampler of every size, such as FMOPS-Net" in words
-    assert "mops.modelnet40-m16 is a MOPSNet for 16 points" in words
+    assert "mops.modelnet40-m16-seed0 is a MOPSNet for 16 points" in words
 
 
 def test_what_a_killed_run_left_beside_the_output_is_removed(cloud, tmp_path):
