@@ -10,7 +10,7 @@ from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.zoo import model_file, names, publish, weights
 from tests.support.models import rewrite, write_run
-from tests.support.records import record
+from tests.support.records import evaluated, record
 
 OF_TASK_NET = {"metrics": {"test/full/accuracy": 0.5}, "score_name": "test/full/accuracy"}
 """Fields of the record of a task net."""
@@ -107,6 +107,51 @@ def test_wide_layers_are_rounded(precision, bits, run, tmp_path):
     sampler: Any = load(path)
     assert sampler.rho_local.weight.dtype == torch.float32
     torch.testing.assert_close(sampler.rho_local.weight, given, rtol=0.004, atol=0.001)
+
+
+def evaluation(folder, sha256, **fields):
+    """Write the record of a test of a model."""
+    folder.mkdir()
+    fields = {"metrics": {"test/m8/generated/accuracy": 0.25}, **fields}
+    tested = {"config": {"learn": "nothing", "m": 8, "dataset": {"n_points": 64}}, **fields}
+    tested["score_name"] = "test/m8/generated/accuracy"
+    tested["evaluated"] = evaluated(weights_sha256=sha256)
+    run_record.write(folder, record(**tested))
+    return folder
+
+
+def test_a_rounded_model_gets_its_own_figures(run, tmp_path):
+    path = publish.add(run, "fmops.small", tmp_path, precision="int8", notes="Mine.")
+    card = model_file.read_card(path)
+    assert card["figures"]["values"] == {"generated": "50.00"}
+    stored = load_file(path)
+
+    publish.measure(path, evaluation(tmp_path / "tested", card["sha256"]))
+
+    measured = model_file.read_card(path)
+    assert measured["figures"]["values"] == {"generated": "25.00"}
+    before = "Wide layers are in 8 bits; the record's figures are those before."
+    assert measured["notes"] == f"Mine. {before}"
+    same = {key: value for key, value in card.items() if key not in ("figures", "notes")}
+    assert same.items() <= measured.items()
+    for name, value in load_file(path).items():
+        assert value.dtype == stored[name].dtype
+        assert torch.equal(value, stored[name])
+
+
+def test_figures_of_another_test_are_refused(run, tmp_path):
+    path = publish.add(run, "fmops.small", tmp_path)
+    sha256 = model_file.read_card(path)["sha256"]
+
+    with pytest.raises(
+        UserError, match=r"run did not test .*\. Give the folder of a run of evaluate="
+    ):
+        publish.measure(path, run)
+    with pytest.raises(UserError, match="other did not test"):
+        publish.measure(path, evaluation(tmp_path / "other", "0" * 64))
+    short = evaluation(tmp_path / "short", sha256, partial=["tested on 1 of 4 batches"])
+    with pytest.raises(UserError, match=r"short is not a whole test\. Repeat it"):
+        publish.measure(path, short)
 
 
 def test_shortened_run_is_no_model(run, tmp_path):

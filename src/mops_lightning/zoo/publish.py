@@ -5,6 +5,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from safetensors.torch import load_file
+
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.records.metric_info import metric_info
@@ -17,6 +19,8 @@ from mops_lightning.zoo.rounding import is_wide, rounded
 BITS = {"float16": 16, "bfloat16": 16, "int8": 8}
 ROUNDED = "The test figures are those before wide layers were rounded to {} bits."
 """Note of a model with rounded weights, since its figures are those of the run."""
+MEASURED = "Wide layers are in {} bits; the record's figures are those before."
+"""Note of a model with rounded weights and figures of its own."""
 
 
 def add(
@@ -79,6 +83,33 @@ def add(
         card["channels"] = content["channels"].to_plain()
     model_file.write(path, card, state)
     return path
+
+
+def measure(path: Path, evaluation: Path) -> None:
+    """Replace the test figures of a model by its own, because rounding moves those of its run.
+
+    Args:
+        path: the model, which is written again.
+        evaluation: folder of a run of ``evaluate=`` with this model.
+
+    Raises:
+        UserError: another model was evaluated, or the run was shortened or not completed.
+    """
+    card = model_file.read_card(path)
+    record = run_record.read(evaluation)
+    evaluated = record.evaluated
+    if evaluated is None or evaluated.weights_sha256 != card["sha256"]:
+        raise UserError(
+            f"{evaluation} did not test {path}. Give the folder of a run of evaluate={path}."
+        )
+    if record.status != "completed" or record.partial:
+        raise UserError(f"{evaluation} is not a whole test. Repeat it without what shortened it.")
+    bits = BITS.get(card["precision"])
+    if bits is not None:
+        card["notes"] = card["notes"].replace(ROUNDED.format(bits), MEASURED.format(bits))
+    card["figures"] = card_figures(record)
+    del card["sha256"]
+    model_file.write(path, card, load_file(path))
 
 
 def _free_path(folder: Path, name: str, overwrite: bool) -> Path:

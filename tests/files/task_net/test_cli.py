@@ -221,7 +221,10 @@ def test_two_comparisons_of_a_seed_agree_exactly(own_scans, scans, tmp_path):
         (["--m", 8, "--angle", 3], r"--angle is for --task icp"),
         (["--m", 8, "--label", "part"], r"--label is for segmentation"),
         (["--m", 8, "--weights", "fmops.unknown"], r"--weights: no file or model"),
-        (["--m", 32, "--weights", "mops.modelnet40-m16-seed0"], r"--m: .* was trained for 16 points"),
+        (
+            ["--m", 32, "--weights", "mops.modelnet40-m16-seed0"],
+            r"--m: .* was trained for 16 points",
+        ),
         (["--m", 8, "--seed", -1], r"--seed must be from 0"),
     ],
 )
