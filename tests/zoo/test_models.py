@@ -29,6 +29,7 @@ ON_THESE_CLOUDS = {
     "mops.modelnet40-m128-seed0": 90.625,
     "snet.modelnet40-m32-seed0": 81.25,
     "samplenet.modelnet40-m32-seed0": 90.625,
+    "snet.modelnet40-m256-seed0": 78.125,
     "snet.modelnet40-m512-seed0": 78.125,
     "snet.modelnet40-m32": 78.125,
     "samplenet.modelnet40-m32": 90.625,
