@@ -9,7 +9,7 @@ from mops_lightning.channels import Channel, PointChannels
 from mops_lightning.errors import UserError
 from mops_lightning.records import run_record
 from mops_lightning.zoo import model_file, names, publish, weights
-from tests.support.models import rewrite, write_run
+from tests.support.models import NAMES, rewrite, write_run
 from tests.support.records import evaluated, record
 
 OF_TASK_NET = {"metrics": {"test/full/accuracy": 0.5}, "score_name": "test/full/accuracy"}
@@ -113,7 +113,9 @@ def evaluation(folder, sha256, **fields):
     """Write the record of a test of a model."""
     folder.mkdir()
     fields = {"metrics": {"test/m8/generated/accuracy": 0.25}, **fields}
-    tested = {"config": {"learn": "nothing", "m": 8, "dataset": {"n_points": 64}}, **fields}
+    config = {"learn": "nothing", "m": 8, "names": NAMES, "dataset": {"n_points": 64}}
+    config |= fields.pop("config", {})
+    tested = {"config": config, **fields}
     tested["score_name"] = "test/m8/generated/accuracy"
     tested["evaluated"] = evaluated(weights_sha256=sha256)
     run_record.write(folder, record(**tested))
@@ -152,6 +154,31 @@ def test_figures_of_another_test_are_refused(run, tmp_path):
     short = evaluation(tmp_path / "short", sha256, partial=["tested on 1 of 4 batches"])
     with pytest.raises(UserError, match=r"short is not a whole test\. Repeat it"):
         publish.measure(path, short)
+    for place, of_data in (
+        ("noisy", {"config": {"test_noise_std": 0.1}}),
+        ("few", {"test_clouds": 3}),
+        ("others", {"config": {"names": {**NAMES, "dataset": "scans"}}}),
+    ):
+        tested = evaluation(tmp_path / place, sha256, **of_data)
+        with pytest.raises(UserError, match=rf"{place} tested .* on other data than the run"):
+            publish.measure(path, tested)
+
+
+def test_a_damaged_model_gets_no_new_header(run, tmp_path):
+    path = publish.add(run, "fmops.small", tmp_path, precision="int8")
+    sha256 = model_file.read_card(path)["sha256"]
+    zeros = {"rho_local.weight.scale": torch.zeros(512, 1)}
+    rewrite(path, zeros, sha256=sha256)
+
+    with pytest.raises(weights.Damaged, match="sha256 differs"):
+        publish.measure(path, evaluation(tmp_path / "tested", sha256))
+
+
+@pytest.mark.parametrize("precision", ["int4", "INT8", "float64", None])
+def test_other_precisions_are_refused(precision, run, tmp_path):
+    allowed = "float32, float16, bfloat16, int8"
+    with pytest.raises(UserError, match=f"precision must be one of {allowed}, got {precision!r}"):
+        publish.add(run, "fmops.small", tmp_path, precision=precision)
 
 
 def test_shortened_run_is_no_model(run, tmp_path):

@@ -118,6 +118,16 @@ def test_read_quantised_tensors_are_refused(saved, dtype):
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e38])
+def test_read_scales_that_are_not_finite_are_refused(value, saved):
+    net, path = saved
+    weight = torch.ones_like(net.state_dict()["head.0.weight"], dtype=torch.int8)
+    scale = torch.full((len(weight), 1), value)
+    rewrite(path, {"head.0.weight": weight * 127, "head.0.weight.scale": scale})
+    with pytest.raises(weights.Damaged, match=r"head\.0\.weight(\.scale)? is not finite"):
+        weights.read(path)
+
+
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 def test_read_not_finite_is_refused(saved, value):
     net, path = saved

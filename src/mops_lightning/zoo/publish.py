@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from safetensors.torch import load_file
 
@@ -52,8 +52,12 @@ def add(
         The file.
 
     Raises:
-        UserError: the name is not allowed or taken, or the run has no weights.
+        UserError: the name is not allowed or taken, the precision is none of these, or the run has
+            no weights.
     """
+    if precision not in get_args(Precision):
+        allowed = ", ".join(get_args(Precision))
+        raise UserError(f"precision must be one of {allowed}, got {precision!r}.")
     path = _free_path(folder, name, overwrite)
     record = _whole_record(run)
     content = weights.read(weights.of_run(run))
@@ -85,31 +89,48 @@ def add(
     return path
 
 
-def measure(path: Path, evaluation: Path) -> None:
+def measure(model: str | Path, evaluation: Path) -> None:
     """Replace the test figures of a model by its own, because rounding moves those of its run.
 
     Args:
-        path: the model, which is written again.
+        model: a file or what ``names.resolve`` takes; its file is written again.
         evaluation: folder of a run of ``evaluate=`` with this model.
 
     Raises:
-        UserError: another model was evaluated, or the run was shortened or not completed.
+        UserError: another model or other test data were evaluated, the test was shortened or did
+            not complete, or the model is damaged.
     """
+    path = names.resolve(model)
+    weights.read(path)  # verifies the tensors, before they get a new header
     card = model_file.read_card(path)
     record = run_record.read(evaluation)
+    if record.status != "completed" or record.partial:
+        raise UserError(f"{evaluation} is not a whole test. Repeat it without what shortened it.")
     evaluated = record.evaluated
     if evaluated is None or evaluated.weights_sha256 != card["sha256"]:
         raise UserError(
             f"{evaluation} did not test {path}. Give the folder of a run of evaluate={path}."
         )
-    if record.status != "completed" or record.partial:
-        raise UserError(f"{evaluation} is not a whole test. Repeat it without what shortened it.")
+    trained = run_record.from_plain(card["record"])
+    if _tested_on(record) != _tested_on(trained):
+        raise UserError(
+            f"{evaluation} tested {path} on other data than the run that trained it. Repeat it "
+            "with the data, noise and corruption of that run."
+        )
     bits = BITS.get(card["precision"])
     if bits is not None:
         card["notes"] = card["notes"].replace(ROUNDED.format(bits), MEASURED.format(bits))
     card["figures"] = card_figures(record)
     del card["sha256"]
     model_file.write(path, card, load_file(path))
+
+
+def _tested_on(record: RunRecord) -> tuple[Any, ...]:
+    """Return what the test figures of a record depend on, besides the nets."""
+    config = record.config
+    dataset = config.get("names", {}).get("dataset")
+    disturbed = (config.get("test_noise_std"), config.get("test_corruption"))
+    return (dataset, record.test_clouds, *disturbed)
 
 
 def _free_path(folder: Path, name: str, overwrite: bool) -> Path:

@@ -17,7 +17,7 @@ from mops_lightning.zoo import model_file, names
 from mops_lightning.zoo.model_file import Damaged as Damaged
 from mops_lightning.zoo.model_file import damaged as damaged
 from mops_lightning.zoo.model_file import digest as digest
-from mops_lightning.zoo.rounding import restored
+from mops_lightning.zoo.rounding import SCALE, restored
 
 FILE = f"weights{model_file.SUFFIX}"
 OTHER_NET = "Check task, task/net, samplers inside it and dataset.classes, or use weights=auto."
@@ -78,11 +78,15 @@ def read(path: str | Path) -> dict[str, Any]:
         raise damaged(path) from None
     if digest(state) != header["sha256"]:
         raise damaged(path, "sha256 differs")
-    state = restored(state)
-    for name, value in state.items():
+    restored_state = restored(state)
+    for name, value in restored_state.items():
         if value.element_size() == 1 and value.dtype != torch.bool:
-            raise Damaged(f"{path}: {name} is quantised ({value.dtype}). Give it in 16 or 32 bits.")
-    if wrong := first_nonfinite(state):
+            raise Damaged(
+                f"{path}: {name} is quantised ({value.dtype}). Give it in 16 or 32 bits, or in "
+                f"int8 with {name}{SCALE} in float32, a row each."
+            )
+    wrong = first_nonfinite(state) or first_nonfinite(restored_state)
+    if wrong:
         raise damaged(path, f"{wrong} is not finite, because the training diverged")
     trained = header.get("record", header)
     return {
@@ -91,7 +95,7 @@ def read(path: str | Path) -> dict[str, Any]:
         "classes": header["classes"],
         "channels": channels_in(header),
         "sha256": header["sha256"],
-        "state": state,
+        "state": restored_state,
     }
 
 
