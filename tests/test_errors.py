@@ -56,13 +56,15 @@ def test_one_line_endings_passes_faults_of_the_program_on():
         raise RuntimeError("fault")
 
 
-def test_did_you_mean_lists_up_to_forty_names_and_suggests_three():
-    names = [f"name{number:02}" for number in range(41)]
+def test_did_you_mean_lists_up_to_800_characters_and_suggests_three():
+    names = [f"name{number:03}" for number in range(90)]
 
-    few = did_you_mean("name0", names[:40])
+    few = did_you_mean("name0", names[:89])
     many = did_you_mean("name0", names)
 
-    assert few.endswith(f" Allowed: {', '.join(names[:40])}.")
+    listed = ", ".join(names[:89])
+    assert len(listed) == 799
+    assert few.endswith(f" Allowed: {listed}.")
     assert "Allowed" not in many
     assert many.count(" or ") == 2
 

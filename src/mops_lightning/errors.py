@@ -17,6 +17,8 @@ USER_ERROR = 2
 INTERRUPTED = 130
 MESSAGE = 300
 """Most characters of a parser's message."""
+LISTED = 800
+"""Most characters of a list of allowed names."""
 
 CLOSED_PIPE = 141
 """128 + SIGPIPE, the status that shells report for other programs."""
@@ -67,7 +69,7 @@ def check_at_least(minimum: float, **arguments: float) -> None:
 
 
 def did_you_mean(name: str, allowed: Iterable[str]) -> str:
-    """Suggest the allowed names closest to ``name``, and list all of them if they are few.
+    """Suggest the allowed names closest to ``name``, and list all of them if that is short.
 
     Args:
         name: the unknown name.
@@ -81,8 +83,9 @@ def did_you_mean(name: str, allowed: Iterable[str]) -> str:
     hint = ""
     if close:
         hint += f" Did you mean {' or '.join(repr(match) for match in close)}?"
-    if len(names) <= 40:
-        hint += f" Allowed: {', '.join(names)}."
+    listed = ", ".join(names)
+    if len(listed) <= LISTED:
+        hint += f" Allowed: {listed}."
     return hint
 
 

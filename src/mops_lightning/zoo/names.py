@@ -107,4 +107,5 @@ def resolve(reference: str | Path) -> Path:
         return saved
     if path.name != text or text.endswith(FILES):
         return path
-    raise UserError(f"no file or model {text!r}.{did_you_mean(text, available())}")
+    hint = did_you_mean(text, available())
+    raise UserError(f"no file or model {text!r}.{hint} `mops-lightning models` lists all models.")
