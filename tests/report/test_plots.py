@@ -193,6 +193,22 @@ def test_heat_maps_show_percentages_of_each_cell_under_the_names_of_the_settings
     assert bar.get_ylabel() == "accuracy (%)"
 
 
+def test_heat_maps_leave_the_place_of_a_missing_readout_empty(tmp_path):
+    for down, across in itertools.product((1, 2), (1, 2)):
+        name = f"{down}{across}"
+        values = {"generated": 1.0}
+        put_cell(tmp_path, f"mops{name}", "mops", values, of={"alpha": down, "tau": across})
+        values = {"generated": 1.0, "projected": 2.0}
+        settings = {"beta": down, "gamma": across}
+        put_cell(tmp_path, f"samplenet{name}", "samplenet", values, of=settings)
+
+    (figure,) = plots(build_report(tmp_path)).values()
+
+    shown = {axis.get_title() for axis in figure.axes if axis.axison} - {""}
+    assert shown == {"mops, generated", "samplenet, generated", "samplenet, projected"}
+    assert [len(axis.images) for axis in figure.axes if not axis.axison] == [0]
+
+
 @pytest.mark.parametrize(("ratio", "kind"), [(20, Normalize), (21, LogNorm)])
 def test_heat_maps_are_logarithmic_beyond_twenty_times_the_smallest_value(ratio, kind, tmp_path):
     for down, across in itertools.product((1, 2), (1, 2)):

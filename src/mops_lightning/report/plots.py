@@ -140,7 +140,10 @@ def heat_maps(table: Table) -> Figure:
         down, across = (key.rpartition(".")[2] for key in planes[name])
         of_row = table.values[table.values["row"] == name]
         norm = _colour_scale(of_row["mean"] * scale)
-        for axis, readout in zip(line, table.readouts(name), strict=False):
+        readouts = table.readouts(name)
+        for axis in line[len(readouts) :]:
+            axis.set_axis_off()
+        for axis, readout in zip(line, readouts, strict=False):
             values = table.of(name, readout)
             plane = values.pivot(index="down", columns="column", values="mean")
             in_order = plane.sort_index().sort_index(axis=1)
