@@ -28,8 +28,9 @@ LONGEST = 1 << 22
 
 SHA256 = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
 NAME_PATTERN = r"^[a-z0-9_-]+(\.[a-z0-9_-]+)+$"
-Precision = Literal["float32", "float16", "bfloat16", "int8"]
 NAME = Annotated[str, msgspec.Meta(pattern=NAME_PATTERN, max_length=100)]
+Precision = Literal["float32", "float16", "bfloat16", "int8"]
+"""Types of the wide weight matrices of a model."""
 
 
 class Figures(msgspec.Struct, forbid_unknown_fields=True):
