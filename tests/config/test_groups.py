@@ -230,7 +230,7 @@ def test_run_label_names_net_or_sampler(learn, label):
         ("outputs/noise/fmops-m512", "noise-fmops-m512"),
         ("../outputs/noise/cell/", "noise-cell"),
         ("fmops.modelnet40-m512", "fmops.modelnet40-m512"),
-        (None, "fps"),
+        (None, "fps-m32"),
     ],
 )
 def test_tested_label_names_the_sweep_and_the_cell_of_the_tested_run(run, label):
@@ -239,6 +239,14 @@ def test_tested_label_names_the_sweep_and_the_cell_of_the_tested_run(run, label)
     cfg.evaluate = run
 
     assert cfg.logger.tested == label
+
+
+def test_tested_label_names_another_size_only_if_it_is_given():
+    cfg = compose(["sampler=fps", "m=16", "+logger.tested=${tested_label:}"])
+
+    cfg.evaluate = "fmops.modelnet40-m512"
+
+    assert cfg.logger.tested == "fmops.modelnet40-m512-m16"
 
 
 def test_labels_name_own_samplers_by_their_class():

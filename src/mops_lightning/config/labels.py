@@ -62,11 +62,21 @@ def sampler_label(_root_: DictConfig) -> str:
 
 
 def tested_label(_root_: DictConfig) -> str:
-    """Return the label of a test's folder: the run or model that it tests, else the sampler."""
+    """Return the label of a test's folder: the run or model that it tests, else the sampler.
+
+    The size of a tested run is in its own name or record; another size is named if it was given.
+    """
+    from hydra.core.hydra_config import HydraConfig
+
+    size = f"-m{_root_.m}"
     if not _root_.evaluate:
-        return sampler_label(_root_)
+        return sampler_label(_root_) + size
     parts = [part for part in Path(_root_.evaluate).parts if part not in NOT_IN_LABELS]
-    return "-".join(parts[-2:])  # of a cell of a sweep: the sweep and the cell
+    label = "-".join(parts[-2:])  # of a cell of a sweep: the sweep and the cell
+    given = [override.partition("=")[0] for override in HydraConfig.get().overrides.task]
+    if "m" in given:
+        label += size
+    return label
 
 
 RESOLVERS = (
