@@ -275,6 +275,35 @@ def test_mixed_table_keeps_samplers_apart_that_would_share_a_cell(tmp_path):
     ]
 
 
+def test_mixed_table_shows_trials_of_one_seed_with_the_settings_they_differ_in(tmp_path):
+    for name, m, lr, seed in (
+        ("a", 8, 1e-2, 0),
+        ("b", 8, 2e-2, 0),
+        ("c", 32, 2e-2, 0),
+        ("d", 32, 2e-2, 1),
+    ):
+        metrics = {"test/generated/accuracy": 10 * lr + seed / 100}
+        config = {"optimizer": {"lr": lr}}
+        put(tmp_path / name, "snet", m, metrics, of={"m": m}, seed=seed, config=config)
+
+    text = table(tmp_path, mixed=True)
+
+    assert our_rows(text)[1:] == [
+        ["snet lr=0.01", "", "10.00"],
+        ["snet lr=0.02", "20.50 ± 0.71 (n=2)", "20.00"],
+    ]
+    assert "not shown" not in text
+
+
+def test_seeds_with_other_settings_stay_one_row_of_a_mixed_table(tmp_path):
+    for name, m, lr, seed in (("a", 8, 1e-2, 0), ("b", 8, 2e-2, 1), ("c", 32, 2e-2, 0)):
+        metrics = {"test/generated/accuracy": 10 * lr}
+        config = {"optimizer": {"lr": lr}}
+        put(tmp_path / name, "snet", m, metrics, of={"m": m}, seed=seed, config=config)
+
+    assert our_rows(table(tmp_path, mixed=True))[1:] == [["snet", "20.00", "15.00 ± 7.07 (n=2)"]]
+
+
 def test_a_whole_number_written_in_two_ways_gives_one_row(tmp_path):
     """The defaults have alpha=30.0, and ``sampler.alpha=30`` on the command line an integer."""
     for name, m, alpha in (("a", 8, 3), ("b", 8, 30.0), ("c", 32, 30)):

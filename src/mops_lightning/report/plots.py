@@ -21,6 +21,13 @@ DARK = colormaps["Dark2"]
 COLOURS += [DARK(number) for number in range(8)]
 """Of curves, in the order of the rows."""
 
+LETTERS = 32
+LINES = 16
+"""Letters in a line of a legend, and lines, that fit beside curves of the usual size."""
+LETTER = 0.07
+LINE = 0.18
+"""Inches that a figure grows for each letter and line more."""
+
 LOG_SCALE_RATIO = 20
 """Heat maps whose largest value exceeds the smallest by more have logarithmic colours."""
 
@@ -63,7 +70,11 @@ def curves(table: Table) -> Figure:
         figure = new_figure(0.16 * len(columns) + 2, 2.2 * number + 1)
         panels = figure.subplots(number, 1, sharex=True)
     else:
-        figure = new_figure(4.2 * number, 3.4)
+        names = table.rows()
+        letters = max(len(name) for name in names)
+        wider = LETTER * max(letters - LETTERS, 0)
+        higher = LINE * max(len(names) - LINES, 0)
+        figure = new_figure(4.2 * number + wider, 3.4 + higher)
         panels = figure.subplots(1, number, sharey=True)
     ticks = [_tick(column) for column in columns]
     for axis, readout in zip(panels, readouts, strict=True):

@@ -15,6 +15,7 @@ from mops_lightning.records.readout_names import (
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.records.summary import baseline_name
 from mops_lightning.report import collect
+from mops_lightning.report.comparable import considered
 from mops_lightning.tree import dotted
 
 READOUTS = (INDEX_READOUT, *GENERATED_READOUTS, PROJECTED)
@@ -42,6 +43,9 @@ ORDER = (
 )
 """Samplers in the order of the paper's tables; others follow by name."""
 
+SAMPLER = "sampler."
+"""Start of the dotted settings that are arguments of the sampler."""
+
 NOT_IN_NAMES = ("m", "seed")
 """Arguments of a sampler that do not give it a row of its own: its runs are cells of one row."""
 
@@ -51,7 +55,8 @@ class RowNames:
 
     A row is a sampler with its recipe. If two runs of it would share a cell though their samplers
     differ, the arguments in which they differ are part of the name: an FMOPS-Net for up to 128
-    points and one for up to 512 are ``fmops m_max=128`` and ``fmops m_max=512``.
+    points and one for up to 512 are ``fmops m_max=128`` and ``fmops m_max=512``. So are other
+    settings in which two runs of one seed differ, such as the learning rates of trials.
 
     Args:
         records: of the table, each with a folder of its own.
@@ -67,6 +72,7 @@ class RowNames:
             rows[_on_net(record, net)].append(record)
         for name, of_row in rows.items():
             keys = _telling_apart(of_row, columns)
+            keys += _of_training(of_row, [*columns, *(SAMPLER + key for key in keys)])
             classes = {_class_of_sampler(record) for record in of_row}
             for record in of_row:
                 words = [name, *_texts(record, keys, classes)]
@@ -101,7 +107,7 @@ def _on_net(record: RunRecord, net: str) -> str:
 
 def _telling_apart(records: Sequence[RunRecord], columns: Sequence[str]) -> list[str]:
     """Return the arguments of a row's samplers in which runs for one cell differ."""
-    own = [key.removeprefix("sampler.") for key in columns]
+    own = [key.removeprefix(SAMPLER) for key in columns]
     cells: dict[Any, list[dict[str, Any]]] = defaultdict(list)
     for record in records:
         settings = dotted(record.config["sampler"])
@@ -112,6 +118,25 @@ def _telling_apart(records: Sequence[RunRecord], columns: Sequence[str]) -> list
     for of_cell in cells.values():
         different |= _different(of_cell)
     return sorted(different.difference(own, NOT_IN_NAMES))
+
+
+def _of_training(records: Sequence[RunRecord], apart: Sequence[str]) -> list[str]:
+    """Return the settings outside the sampler in which runs for one cell and seed differ.
+
+    Args:
+        records: of a row.
+        apart: settings by which the runs are told apart already.
+    """
+    cells: dict[Any, list[dict[str, Any]]] = defaultdict(list)
+    for record in records:
+        settings = considered(record) | dotted(record.config["sampler"], "sampler")
+        place = tuple(collect.text_to_compare(settings.get(key)) for key in apart)
+        for m in _sizes(record):
+            cells[place, m, collect.seed(record), record.task_weights_sha256].append(settings)
+    different: set[str] = set()
+    for of_cell in cells.values():
+        different |= _different(of_cell)
+    return sorted(key for key in different if not key.startswith(SAMPLER))
 
 
 def _different(several: Sequence[dict[str, Any]]) -> set[str]:
@@ -142,26 +167,38 @@ def _sizes(record: RunRecord) -> set[int]:
 
 
 def _texts(record: RunRecord, keys: Sequence[str], classes: set[str]) -> list[str]:
-    """Return arguments of a record's sampler as parts of a name.
+    """Return arguments of a record's sampler, and other settings, as parts of a name.
 
     Args:
         record: of a run.
-        keys: the arguments.
+        keys: the arguments and the dotted settings.
         classes: of all samplers of the row; one is shown by its last name where that differs.
     """
-    settings = dotted(record.config["sampler"])
+    settings = considered(record) | dotted(record.config["sampler"])
     last_names = {name.rpartition(".")[2] for name in classes}
     are_unique = len(last_names) == len(classes)
+    labels = _short(keys)
     texts = []
     for key in keys:
         value = str(collect.plain_number(settings.get(key)))
         if key != "_target_":
-            texts.append(f"{key}={value}")
+            texts.append(f"{labels[key]}={value}")
         elif are_unique:
             texts.append(value.rpartition(".")[2])
         else:
             texts.append(value)
     return texts
+
+
+def _short(keys: Sequence[str]) -> dict[str, str]:
+    """Return the last name of each dotted setting, or the whole one where two would be equal."""
+    last_names = [key.rpartition(".")[2] for key in keys]
+    labels = {}
+    for key, last_name in zip(keys, last_names, strict=True):
+        labels[key] = last_name
+        if last_names.count(last_name) > 1:
+            labels[key] = key
+    return labels
 
 
 def net_labels(found: Sequence[RunRecord]) -> list[str]:
