@@ -22,6 +22,18 @@ def test_voxels_of_small_gicp_keep_as_many_points_as_are_asked_for_where_they_ca
     assert 1 <= len(seven) <= 7
 
 
+def test_voxels_of_small_gicp_take_map_coordinates(capfd):
+    """Beyond voxel 2^20 from the origin, the library takes all points for one, and warns."""
+    local = normal_points(2000, 0).astype(np.float64)
+    voxels = VoxelFilter()
+
+    kept = voxels.sample(local + [500_000.0, 4_649_000.0, 200.0], 64, 0, SCAN).points
+
+    assert 48 <= len(kept) <= 64
+    assert np.ptp(kept, axis=0).min() > np.ptp(local, axis=0).min() / 2
+    assert capfd.readouterr().err == ""
+
+
 def test_method_by_name_depends_on_the_seed():
     points = normal_points(200, 0)
     method = ByName("random")

@@ -105,20 +105,30 @@ class VoxelFilter(Method):
 
     def sample(self, points: Points, m: int, seed: int, path: Path) -> Sample:
         """Return at most m means of points ``(N, 3)``; the seed has no effect."""
-        library = small_gicp()
         extent = float(np.ptp(points, axis=0).max()) or 1.0
         fine = extent / 2**19  # small_gicp's voxels have 21 bits along an axis
         coarse = 2 * extent
         for _ in range(BISECTIONS):
             middle = np.sqrt(fine * coarse)
-            if library.voxelgrid_sampling(points, middle).size() > m:
+            if len(_means_of_voxels(points, middle)) > m:
                 fine = middle
             else:
                 coarse = middle
         began = time.process_time()
-        means = library.voxelgrid_sampling(points, coarse).points()
+        means = _means_of_voxels(points, coarse)
         seconds = time.process_time() - began
-        return Sample(np.ascontiguousarray(means[:, :3]), seconds)
+        return Sample(means, seconds)
+
+
+def _means_of_voxels(points: Points, size: float) -> Points:
+    """Return the means of the points ``(N, 3)`` in each occupied voxel of a size, ``(K, 3)``.
+
+    small_gicp counts voxels from the origin, and takes all points beyond voxel 2^20, as map
+    coordinates may be, for one. So whole voxels are subtracted first.
+    """
+    corner = np.floor(points.min(0) / size) * size
+    means = small_gicp().voxelgrid_sampling(points - corner, size).points()[:, :3]
+    return np.ascontiguousarray(means + corner)
 
 
 def methods_of(
