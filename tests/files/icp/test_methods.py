@@ -23,7 +23,7 @@ def test_voxels_of_small_gicp_keep_as_many_points_as_are_asked_for_where_they_ca
 
 
 def test_voxels_of_small_gicp_take_map_coordinates(capfd):
-    """Beyond voxel 2^20 from the origin, the library takes all points for one, and warns."""
+    """Beyond voxel 2^20 from the origin, the library leaves points out, and warns."""
     local = normal_points(2000, 0).astype(np.float64)
     voxels = VoxelFilter()
 

@@ -123,8 +123,8 @@ class VoxelFilter(Method):
 def _means_of_voxels(points: Points, size: float) -> Points:
     """Return the means of the points ``(N, 3)`` in each occupied voxel of a size, ``(K, 3)``.
 
-    small_gicp counts voxels from the origin, and takes all points beyond voxel 2^20, as map
-    coordinates may be, for one. So whole voxels are subtracted first.
+    small_gicp counts voxels from the origin, and leaves out points beyond voxel 2^20, where those
+    in map coordinates may be. So whole voxels are subtracted first.
     """
     corner = np.floor(points.min(0) / size) * size
     means = small_gicp().voxelgrid_sampling(points - corner, size).points()[:, :3]
