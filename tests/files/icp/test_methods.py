@@ -25,9 +25,9 @@ def test_voxels_of_small_gicp_keep_as_many_points_as_are_asked_for_where_they_ca
 def test_voxels_of_small_gicp_take_map_coordinates(capfd):
     """Beyond voxel 2^20 from the origin, the library leaves points out, and warns."""
     local = normal_points(2000, 0).astype(np.float64)
-    voxels = VoxelFilter()
+    utm = local + np.array([500_000.0, 4_649_000.0, 200.0])
 
-    kept = voxels.sample(local + [500_000.0, 4_649_000.0, 200.0], 64, 0, SCAN).points
+    kept = VoxelFilter().sample(utm, 64, 0, SCAN).points
 
     assert 48 <= len(kept) <= 64
     assert np.ptp(kept, axis=0).min() > np.ptp(local, axis=0).min() / 2
