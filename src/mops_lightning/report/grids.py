@@ -288,7 +288,7 @@ def _full_lines(table: Table) -> list[str]:
             text = f"{metric.title} {text}"
         if net == table.net and "full" in published:
             text += f" (the paper: {published['full']:.2f})"
-        after = _after_joint(record)
+        after = _after_joint(table, record)
         lines.append(f"{net} on all points{after}: {text}.")
     return list(dict.fromkeys(lines))
 
@@ -297,11 +297,12 @@ def _by_row_and_size(record: RunRecord) -> tuple[str, int]:
     return collect.sampler_row(record), -record.config["m"]
 
 
-def _after_joint(record: RunRecord) -> str:
-    """Return the sampler that a net was trained with, as a part of a sentence; empty if alone."""
+def _after_joint(table: Table, record: RunRecord) -> str:
+    """Return the row that a net was trained with, as a part of a sentence; empty if alone."""
     if collect.trained_with(record) != "joint":
         return ""
-    text = f" after joint training with {collect.sampler_row(record)}"
+    row = table.row_names.of(record).rpartition(" on ")[2]  # the net is named already
+    text = f" after joint training with {row}"
     if not _has_several_sizes(record):
         text += f", m={record.config['m']}"
     return text
