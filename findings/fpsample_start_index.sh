@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# fpsample 1.0.2's bucket methods ignore start_idx: the given point is hardly ever in the sample.
+# fpsample 1.0.2's bucket methods begin with another point than start_idx.
 #
 # Its documentation says that start_idx is the starting index, and that several of them will all be
 # in the sample. Eight of 20,000 random points are chosen from 400 starts. Seen: fps_sampling always

@@ -295,6 +295,44 @@ def test_mixed_table_shows_trials_of_one_seed_with_the_settings_they_differ_in(t
     assert "not shown" not in text
 
 
+def test_trials_are_named_by_the_optimizer_and_by_what_all_of_them_have(tmp_path):
+    adam = {"_target_": "torch.optim.Adam", "lr": 0.01}
+    muon = {"_target_": "mops_lightning.training.muon.MuonAdam", "lr": 0.01, "momentum": 0.95}
+    for name, m, optimizer in (("a", 8, adam), ("b", 8, muon), ("c", 32, muon)):
+        metrics = {"test/generated/accuracy": 0.5}
+        put(tmp_path / name, "snet", m, metrics, of={"m": m}, config={"optimizer": optimizer})
+
+    assert our_rows(table(tmp_path, mixed=True))[1:] == [
+        ["snet Adam", "", "50.00"],
+        ["snet MuonAdam", "50.00", "50.00"],
+    ]
+
+
+def test_a_test_of_a_run_has_no_rate_of_its_own(tmp_path):
+    """Its record has the optimizer's defaults: ``evaluate=RUN`` does not take RUN's optimizer."""
+    metrics = {"test/generated/accuracy": 0.5}
+    for name, lr, rest in (("a", 0.02, {}), ("b", 0.01, {"evaluated": evaluated()})):
+        config = {"optimizer": {"lr": lr}}
+        put(tmp_path / name, "snet", 8, metrics, of={"m": 8}, config=config, **rest)
+    put(tmp_path / "c", "snet", 32, metrics, of={"m": 32}, config={"optimizer": {"lr": 0.02}})
+
+    for mixed in (True, False):
+        text = table(tmp_path, mixed=mixed)
+        assert "lr=" not in text
+
+
+def test_numbers_in_names_of_rows_are_sorted_by_their_values():
+    names = ["mops epochs=110", "mops epochs=60", "mops lr=0.02", "mops lr=1e-05", "fps"]
+
+    assert sorted(names, key=sort_key) == [
+        "fps",
+        "mops epochs=60",
+        "mops epochs=110",
+        "mops lr=1e-05",
+        "mops lr=0.02",
+    ]
+
+
 def test_seeds_with_other_settings_stay_one_row_of_a_mixed_table(tmp_path):
     for name, m, lr, seed in (("a", 8, 1e-2, 0), ("b", 8, 2e-2, 1), ("c", 32, 2e-2, 0)):
         metrics = {"test/generated/accuracy": 10 * lr}

@@ -64,7 +64,7 @@ def sampler_label(_root_: DictConfig) -> str:
 def tested_label(_root_: DictConfig) -> str:
     """Return the label of a test's folder: the run or model that it tests, else the sampler.
 
-    The size of a tested run is in its own name or record; another size is named if it was given.
+    The size of a tested run is in its own name or record; one that is given with it is named.
     """
     from hydra.core.hydra_config import HydraConfig
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import pandas as pd
 
+from mops_lightning.config.settings import of as declaration
 from mops_lightning.config.shared_settings import table_settings, with_defaults
 from mops_lightning.records.run_record import RunRecord
 from mops_lightning.records.summary import OF_TEST_CLOUDS
@@ -306,27 +307,36 @@ def _by_settings(group: Group, different: dict[Row, list[str]]) -> list[Group]:
 
 def varying(found: list[RunRecord]) -> list[str]:
     """Return the dotted settings in which records of one sampler differ."""
-    settings = [considered(record) for record in found]
+    runs = [(considered(record), record.evaluated is not None) for record in found]
     keys: set[str] = set()
-    for of_run in settings:
+    for of_run, _ in runs:
         keys.update(of_run)
     different = []
     for key in keys:
-        texts = {text_to_compare(of_run.get(key)) for of_run in settings}
+        texts = set()
+        for of_run, is_evaluated in runs:
+            if key in of_run or not is_evaluated:  # a test does not know how its run was trained
+                texts.add(text_to_compare(of_run.get(key)))
         if len(texts) > 1:
             different.append(key)
     return sorted(different)
 
 
 def considered(record: RunRecord) -> dict[str, Any]:
-    """Return the settings that are compared, with dotted keys, and the epochs trained."""
+    """Return the settings that are compared, with dotted keys, and the epochs trained.
+
+    Those of a test of a trained run are the run's, but for settings that ``evaluate=RUN`` does not
+    take from it, such as the optimizer: they are left out.
+    """
     learn = record.config["learn"]
     if record.evaluated:
         learn = record.evaluated.learn
-    settings = table_settings(record.config, learn)
-    settings |= dotted(recorded_recipe(record), "recipe")
-    settings["trainer.max_epochs"] = epochs(record)
-    return settings
+    compared = table_settings(record.config, learn)
+    if record.evaluated:
+        compared = {key: value for key, value in compared.items() if declaration(key).repeated}
+    compared |= dotted(recorded_recipe(record), "recipe")
+    compared["trainer.max_epochs"] = epochs(record)
+    return compared
 
 
 def value(record: RunRecord, key: str) -> Any:

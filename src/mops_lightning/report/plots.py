@@ -20,6 +20,8 @@ COLOURS: list[Any] = [f"C{number}" for number in range(10)]
 DARK = colormaps["Dark2"]
 COLOURS += [DARK(number) for number in range(8)]
 """Of curves, in the order of the rows."""
+MARKERS = "os^v"
+"""Of curves; another one where all colours are taken."""
 
 LETTERS = 32
 LINES = 16
@@ -115,7 +117,7 @@ def _draw_curves(axis: Any, table: Table, readout: str, columns: Sequence[Any]) 
             label=name,
             color=COLOURS[number % len(COLOURS)],
             linestyle=style,
-            marker="o",
+            marker=MARKERS[number // len(COLOURS) % len(MARKERS)],
             markersize=3,
             capsize=2,
         )

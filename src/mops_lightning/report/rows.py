@@ -1,5 +1,7 @@
 """The rows of tables: their names and their order."""
 
+import math
+import re
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
@@ -43,8 +45,14 @@ ORDER = (
 )
 """Samplers in the order of the paper's tables; others follow by name."""
 
+NUMBER = re.compile(r"((?<==)[-+.e0-9]+)")
+"""A number behind an equals sign in the name of a row."""
+
 SAMPLER = "sampler."
 """Start of the dotted settings that are arguments of the sampler."""
+
+TARGET = "_target_"
+"""The setting that names a class."""
 
 NOT_IN_NAMES = ("m", "seed")
 """Arguments of a sampler that do not give it a row of its own: its runs are cells of one row."""
@@ -72,7 +80,8 @@ class RowNames:
             rows[_on_net(record, net)].append(record)
         for name, of_row in rows.items():
             keys = _telling_apart(of_row, columns)
-            keys += _of_training(of_row, [*columns, *(SAMPLER + key for key in keys)])
+            apart = [*columns, *(SAMPLER + key for key in keys)]
+            keys += _of_training(of_row, apart, are_of_one_net=bool(net))
             classes = {_class_of_sampler(record) for record in of_row}
             for record in of_row:
                 words = [name, *_texts(record, keys, classes)]
@@ -93,7 +102,7 @@ class RowNames:
 
 def _class_of_sampler(record: RunRecord) -> str:
     sampler = record.config["sampler"] or {}
-    return str(sampler.get("_target_"))
+    return str(sampler.get(TARGET))
 
 
 def _on_net(record: RunRecord, net: str) -> str:
@@ -120,22 +129,29 @@ def _telling_apart(records: Sequence[RunRecord], columns: Sequence[str]) -> list
     return sorted(different.difference(own, NOT_IN_NAMES))
 
 
-def _of_training(records: Sequence[RunRecord], apart: Sequence[str]) -> list[str]:
+def _of_training(
+    records: Sequence[RunRecord], apart: Sequence[str], are_of_one_net: bool
+) -> list[str]:
     """Return the settings outside the sampler in which runs for one cell and seed differ.
 
     Args:
         records: of a row.
         apart: settings by which the runs are told apart already.
+        are_of_one_net: whether the columns are not the nets.
     """
     cells: dict[Any, list[dict[str, Any]]] = defaultdict(list)
     for record in records:
         settings = considered(record) | dotted(record.config["sampler"], "sampler")
         place = tuple(collect.text_to_compare(settings.get(key)) for key in apart)
+        net = None
+        if not are_of_one_net:
+            net = record.task_weights_sha256
         for m in _sizes(record):
-            cells[place, m, collect.seed(record), record.task_weights_sha256].append(settings)
+            cells[place, net, m, collect.seed(record)].append(settings)
     different: set[str] = set()
     for of_cell in cells.values():
-        different |= _different(of_cell)
+        shared = set.intersection(*map(set, of_cell))  # Adam has no momentum, and a test no rate
+        different |= _different(of_cell) & shared
     return sorted(key for key in different if not key.startswith(SAMPLER))
 
 
@@ -180,14 +196,24 @@ def _texts(record: RunRecord, keys: Sequence[str], classes: set[str]) -> list[st
     labels = _short(keys)
     texts = []
     for key in keys:
-        value = str(collect.plain_number(settings.get(key)))
-        if key != "_target_":
+        value = _written(settings.get(key))
+        is_class = key.rpartition(".")[2] == TARGET
+        if not is_class:
             texts.append(f"{labels[key]}={value}")
-        elif are_unique:
+        elif are_unique or key != TARGET:
             texts.append(value.rpartition(".")[2])
         else:
             texts.append(value)
     return texts
+
+
+def _written(value: Any) -> str:
+    """Return a setting as a user writes it."""
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return str(collect.plain_number(value))
 
 
 def _short(keys: Sequence[str]) -> dict[str, str]:
@@ -230,11 +256,20 @@ def _net_label(record: RunRecord) -> str:
     return f"{name} ({file})"
 
 
-def sort_key(row: str) -> tuple[bool, int, str]:
-    """Return a key that sorts rows as the paper's tables do, rows of other nets last."""
+def sort_key(row: str) -> tuple[bool, int, list[tuple[float, str]]]:
+    """Return a key that sorts rows as the paper's tables do, rows of other nets last.
+
+    Numbers in names are sorted by their values.
+    """
     _, other_net, sampler = row.rpartition(" on ")  # such as "dgcnn on mops fast"
     name = sampler.split()[0]  # without its recipe
     place = len(ORDER)
     if name in ORDER:
         place = ORDER.index(name)
-    return bool(other_net), place, row
+    parts = []
+    for part in NUMBER.split(row):
+        try:
+            parts.append((float(part), ""))
+        except ValueError:
+            parts.append((-math.inf, part))
+    return bool(other_net), place, parts
