@@ -321,6 +321,18 @@ def test_a_test_of_a_run_has_no_rate_of_its_own(tmp_path):
         assert "lr=" not in text
 
 
+def test_a_test_beside_trials_of_two_rates_is_named_without_a_rate(tmp_path):
+    metrics = {"test/generated/accuracy": 0.5}
+    for name, m, lr in (("a", 8, 0.02), ("b", 8, 0.04), ("c", 32, 0.04)):
+        put(tmp_path / name, "snet", m, metrics, of={"m": m}, config={"optimizer": {"lr": lr}})
+    of_test = {"config": {"optimizer": {"lr": 0.01}}, "evaluated": evaluated(max_epochs=None)}
+    put(tmp_path / "d", "snet", 8, metrics, of={"m": 8}, **of_test)
+
+    names = [row[0] for row in our_rows(table(tmp_path, mixed=True))[1:]]
+
+    assert names == ["snet", "snet lr=0.02", "snet lr=0.04"]
+
+
 def test_numbers_in_names_of_rows_are_sorted_by_their_values():
     names = ["mops epochs=110", "mops epochs=60", "mops lr=0.02", "mops lr=1e-05", "fps"]
 

@@ -54,6 +54,9 @@ SAMPLER = "sampler."
 TARGET = "_target_"
 """The setting that names a class."""
 
+UNKNOWN_TO_TESTS = ("optimizer.", "trainer.")
+"""Starts of the settings that a test of a trained run does not take from it."""
+
 NOT_IN_NAMES = ("m", "seed")
 """Arguments of a sampler that do not give it a row of its own: its runs are cells of one row."""
 
@@ -147,10 +150,13 @@ def _of_training(
         if not are_of_one_net:
             net = record.task_weights_sha256
         for m in _sizes(record):
-            cells[place, net, m, collect.seed(record)].append(settings)
+            cell = (place, net, m, collect.seed(record))
+            cells[cell].append(settings)
+            if not record.evaluated:  # alone, too: a test does not know its run's rate
+                cells["trained", *cell].append(settings)
     different: set[str] = set()
     for of_cell in cells.values():
-        shared = set.intersection(*map(set, of_cell))  # Adam has no momentum, and a test no rate
+        shared = set.intersection(*map(set, of_cell))  # Adam has no momentum
         different |= _different(of_cell) & shared
     return sorted(key for key in different if not key.startswith(SAMPLER))
 
@@ -196,6 +202,8 @@ def _texts(record: RunRecord, keys: Sequence[str], classes: set[str]) -> list[st
     labels = _short(keys)
     texts = []
     for key in keys:
+        if key.startswith(UNKNOWN_TO_TESTS) and key not in settings:
+            continue
         value = _written(settings.get(key))
         is_class = key.rpartition(".")[2] == TARGET
         if not is_class:
