@@ -7,6 +7,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
+from mops_lightning.config import overrides
 from mops_lightning.config.help import run_level_keys, selectable_groups
 
 NAMED = {
@@ -68,14 +69,13 @@ def tested_label(_root_: DictConfig) -> str:
     """
     from hydra.core.hydra_config import HydraConfig
 
-    size = f"-m{_root_.m}"
     if not _root_.evaluate:
-        return sampler_label(_root_) + size
+        return f"{sampler_label(_root_)}-m{_root_.m}"
     parts = [part for part in Path(_root_.evaluate).parts if part not in NOT_IN_LABELS]
     label = "-".join(parts[-2:])  # of a cell of a sweep: the sweep and the cell
-    given = [override.partition("=")[0] for override in HydraConfig.get().overrides.task]
+    given = [overrides.path(argument) for argument in HydraConfig.get().overrides.task]
     if "m" in given:
-        label += size
+        label += f"-m{_root_.m}"
     return label
 
 

@@ -54,9 +54,6 @@ SAMPLER = "sampler."
 TARGET = "_target_"
 """The setting that names a class."""
 
-UNKNOWN_TO_TESTS = ("optimizer.", "trainer.")
-"""Starts of the settings that a test of a trained run does not take from it."""
-
 NOT_IN_NAMES = ("m", "seed")
 """Arguments of a sampler that do not give it a row of its own: its runs are cells of one row."""
 
@@ -84,10 +81,11 @@ class RowNames:
         for name, of_row in rows.items():
             keys = _telling_apart(of_row, columns)
             apart = [*columns, *(SAMPLER + key for key in keys)]
-            keys += _of_training(of_row, apart, are_of_one_net=bool(net))
+            of_training = _of_training(of_row, apart, are_of_one_net=bool(net))
             classes = {_class_of_sampler(record) for record in of_row}
             for record in of_row:
                 words = [name, *_texts(record, keys, classes)]
+                words += _texts_of_training(record, of_training)
                 self._names[record.folder] = " ".join(words)
 
     def of(self, record: RunRecord) -> str:
@@ -189,29 +187,41 @@ def _sizes(record: RunRecord) -> set[int]:
 
 
 def _texts(record: RunRecord, keys: Sequence[str], classes: set[str]) -> list[str]:
-    """Return arguments of a record's sampler, and other settings, as parts of a name.
+    """Return arguments of a record's sampler as parts of a name.
 
     Args:
         record: of a run.
-        keys: the arguments and the dotted settings.
+        keys: the arguments.
         classes: of all samplers of the row; one is shown by its last name where that differs.
     """
-    settings = considered(record) | dotted(record.config["sampler"])
+    settings = dotted(record.config["sampler"])
     last_names = {name.rpartition(".")[2] for name in classes}
     are_unique = len(last_names) == len(classes)
-    labels = _short(keys)
     texts = []
     for key in keys:
-        if key.startswith(UNKNOWN_TO_TESTS) and key not in settings:
-            continue
         value = _written(settings.get(key))
-        is_class = key.rpartition(".")[2] == TARGET
-        if not is_class:
-            texts.append(f"{labels[key]}={value}")
-        elif are_unique or key != TARGET:
+        if key != TARGET:
+            texts.append(f"{key}={value}")
+        elif are_unique:
             texts.append(value.rpartition(".")[2])
         else:
             texts.append(value)
+    return texts
+
+
+def _texts_of_training(record: RunRecord, keys: Sequence[str]) -> list[str]:
+    """Return dotted settings of a record as parts of a name; a test lacks those of its run."""
+    settings = considered(record)
+    labels = _short(keys)
+    texts = []
+    for key in keys:
+        if key not in settings:
+            continue
+        value = _written(settings[key])
+        if key.rpartition(".")[2] == TARGET:
+            texts.append(value.rpartition(".")[2])
+        else:
+            texts.append(f"{labels[key]}={value}")
     return texts
 
 
