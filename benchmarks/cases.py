@@ -16,7 +16,12 @@ from mops_lightning.nets.pointnet import PointNetVanilla
 from mops_lightning.ops.attention import attend
 from mops_lightning.ops.flat_fps import fps
 from mops_lightning.ops.fps import farthest_point_sample
-from mops_lightning.ops.nearest import k_nearest, nearest, search_in_blocks
+from mops_lightning.ops.nearest import (
+    k_nearest,
+    nearest,
+    nearest_features,
+    search_in_blocks,
+)
 from mops_lightning.ops.readout import complete, match
 from mops_lightning.samplers.base import stream_sample
 from mops_lightning.samplers.fps import FPSSampler
@@ -288,6 +293,26 @@ def several(peak: dict[str, float], rounds: int) -> list[Row]:
     return rows
 
 
+def features(peak: dict[str, float], rounds: int) -> list[Row]:
+    """The 16 nearest points in the space of features, by compiled loops and a matrix product."""
+    rows: list[Row] = []
+    for number in (256, 1024):
+        for channels in (3, 64, 128):
+            known = torch.randn(8, number, channels, generator=torch.Generator().manual_seed(0))
+            calls: Calls = {
+                "16 nearest features": partial(nearest_features, known, 16),
+                "by a matrix product": partial(_by_product, known, 16),
+            }
+            names = {"N": number, "channels": channels}
+            rows += _rows("search", calls, names, rounds, peak, clouds=8)
+    return rows
+
+
+def _by_product(known: Tensor, k: int) -> Tensor:
+    """Find nearest features as other devices do."""
+    return torch.cdist(known, known).topk(k, largest=False).indices
+
+
 def growth(peak: dict[str, float], rounds: int) -> list[Row]:
     """Time and memory for N up to 10,000,000 and m up to 65,536 in chunks of 65,536; one call."""
     sizes = [(100_000, m) for m in (256, 4096, 16384, 65536)]
@@ -342,6 +367,7 @@ ALL: dict[str, Callable[[dict[str, float], int], list[Row]]] = {
     "poisson": poisson,
     "neighbours": neighbours,
     "several": several,
+    "features": features,
     "growth": growth,
     # Last, because they change the process's memory settings; also on the command line.
     "training": training,

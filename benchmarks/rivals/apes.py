@@ -8,11 +8,12 @@ from torch import Tensor, nn
 
 from mops_lightning.errors import UserError, check_at_least
 from mops_lightning.losses.subset import simplification_losses
+from mops_lightning.ops.nearest import nearest_features
 from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.types import SampleOutput
 
-from .edge_net import EdgeEmbedding, NeighbourAttention, feature_neighbours
+from .edge_net import EdgeEmbedding, NeighbourAttention
 from .selector import straight_through
 
 STAGES = 2
@@ -43,7 +44,7 @@ class EdgeSampling(nn.Module):
             rows = torch.arange(logits.shape[2], device=logits.device).expand_as(logits)
             return weights.sum(1), weights, rows
         # The published keys are those of f_j − f_i: the part of f_i is cancelled by the softmax.
-        rows = feature_neighbours(features, self.k)
+        rows = nearest_features(features, self.k)
         weights = logits.gather(2, rows).softmax(2)
         return weights.std(2, unbiased=False), weights, rows
 

@@ -6,18 +6,10 @@ Neighbours are the k nearest points in the space of the current features, as pub
 import torch
 from torch import Tensor, nn
 
+from mops_lightning.ops.nearest import nearest_features
+
 SLOPE = 0.2
 """Of the leaky ReLU."""
-
-
-def feature_neighbours(features: Tensor, k: int) -> Tensor:
-    """Return the rows ``(B, N, k)`` of the nearest features ``(B, N, C)``, each point's own first.
-
-    Clouds with fewer than k points have N neighbours.
-    """
-    with torch.no_grad():
-        distances = torch.cdist(features, features)
-        return distances.topk(min(k, features.shape[1]), largest=False).indices
 
 
 def neighbour_mask(rows: Tensor) -> Tensor:
@@ -66,7 +58,7 @@ class EdgeConvolution(nn.Module):
         # The first layer is linear: it is applied to every point once, not to every edge.
         own = nn.functional.linear(features, of_own - of_difference)
         neighbour = nn.functional.linear(features, of_difference)
-        near = gather_features(neighbour, feature_neighbours(features, self.k))
+        near = gather_features(neighbour, nearest_features(features, self.k))
         edges = own[:, :, None] + near
         return self.rest(edges.flatten(0, 2)).unflatten(0, edges.shape[:3]).max(2).values
 
@@ -128,7 +120,7 @@ class NeighbourAttention(nn.Module):
 
     def attend(self, features: Tensor) -> Tensor:
         """Return the attention ``(B, N, channels)`` of every point to its neighbours."""
-        near = neighbour_mask(feature_neighbours(features, self.k))
+        near = neighbour_mask(nearest_features(features, self.k))
         queries = self._by_head(self.queries(features))
         # The key of f_j − f_i differs from that of f_j by the same for all j: softmax cancels it.
         keys = self._by_head(self.keys(features))

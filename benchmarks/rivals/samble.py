@@ -4,12 +4,13 @@ import torch
 from torch import Tensor, nn
 
 from mops_lightning.errors import check_at_least
+from mops_lightning.ops.nearest import nearest_features
 from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.ordering import point_hashes
 from mops_lightning.types import SampleOutput
 
-from .edge_net import EdgeEmbedding, NeighbourAttention, feature_neighbours, neighbour_mask
+from .edge_net import EdgeEmbedding, NeighbourAttention, neighbour_mask
 from .selector import straight_through
 
 STAGES = 2
@@ -131,7 +132,7 @@ class BinSampling(nn.Module):
         logits = self.queries(features) @ keys.mT * keys.shape[2] ** -0.5
         attention = logits.softmax(2)
         with torch.no_grad():
-            scores = sparse_scores(attention[..., :n], feature_neighbours(features, self.k))
+            scores = sparse_scores(attention[..., :n], nearest_features(features, self.k))
             scores = scores - scores.mean(1, keepdim=True)
             scores = scores / scores.std(1, keepdim=True, unbiased=False).clamp(min=SMALL)
             if self.training:

@@ -11,7 +11,7 @@ from torch.testing import assert_close
 from mops_lightning.errors import UserError
 from mops_lightning.ops import compiled
 from mops_lightning.ops import nearest as search
-from mops_lightning.ops.nearest import chamfer_distance, k_nearest, nearest
+from mops_lightning.ops.nearest import chamfer_distance, k_nearest, nearest, nearest_features
 from tests.support.plain import plain_nearest
 
 
@@ -205,6 +205,59 @@ def test_k_nearest_out_of_range_raises(k):
 
     with pytest.raises(UserError, match=rf"k must be from 1 .*N=5, got {k}"):
         k_nearest(queries, points, k)
+
+
+def check_features_against_plain_distances(k, channels, rng):
+    features = torch.randn(2, 40, channels, generator=rng)
+
+    rows = nearest_features(features, k)
+
+    squares = (features[:, :, None] - features[:, None]).double().square().sum(3)
+    expected = squares.argsort(2)[..., :k]
+    assert torch.equal(rows, expected)
+
+
+@pytest.mark.parametrize("channels", [3, 64])
+@pytest.mark.parametrize("k", [1, 4, 16])
+def test_nearest_features_equal_plain_distances(k, channels, rng):
+    check_features_against_plain_distances(k, channels, rng)
+
+
+@pytest.mark.usefixtures("without_compiled_loops")
+@pytest.mark.parametrize("channels", [3, 64])
+@pytest.mark.parametrize("k", [1, 4, 16])
+def test_nearest_features_by_product_equal_plain_distances(k, channels, rng):
+    check_features_against_plain_distances(k, channels, rng)
+
+
+def test_nearest_features_equal_those_of_a_tree(rng):
+    features = torch.randn(1, 300, 8, generator=rng)
+
+    (rows,) = nearest_features(features, 12)
+
+    _, expected = cKDTree(features[0].numpy()).query(features[0].numpy(), 12)
+    assert np.array_equal(rows.numpy(), expected)
+
+
+def test_nearest_features_of_equal_points_are_the_lowest_rows():
+    features = torch.tensor([[[1.0, 2.0]] * 3 + [[5.0, 5.0]] * 2])
+
+    rows = nearest_features(features, 2)
+
+    assert rows.tolist() == [[[0, 1], [0, 1], [0, 1], [3, 4], [3, 4]]]
+
+
+def test_nearest_features_of_fewer_points_than_k_are_all_points(randn):
+    rows = nearest_features(randn(2, 3, 4), 20)
+
+    assert rows.shape == (2, 3, 3)
+    assert torch.equal(rows.sort(2).values, torch.arange(3).expand(2, 3, 3))
+
+
+def test_nearest_features_in_half_precision_compare_in_float32(rng):
+    features = torch.randn(1, 50, 16, generator=rng).bfloat16()
+
+    assert torch.equal(nearest_features(features, 5), nearest_features(features.float(), 5))
 
 
 def plain_chamfer(points, others):

@@ -15,6 +15,7 @@ from mops_lightning.nets.layers import check_channels
 from mops_lightning.nets.max_pool import PointMaxPool
 from mops_lightning.nets.pointnet import classifier_head
 from mops_lightning.ops.maxima import max_of_rows
+from mops_lightning.ops.nearest import nearest_features
 
 
 class EdgeConv(nn.Module):
@@ -45,9 +46,7 @@ class EdgeConv(nn.Module):
             places: ``(B, N, D)``, by whose distances neighbours are found; x in the publication.
         """
         n = features.shape[1]
-        with torch.no_grad():
-            distances = torch.cdist(places, places)
-            rows = distances.topk(min(self.k, n), largest=False).indices
+        rows = nearest_features(places, self.k)
         edges = self.edge(features)
         mixed = self.own(features) - edges + max_of_rows(edges, rows)
         rows_of_all = mixed.flatten(0, 1)

@@ -79,6 +79,28 @@ def k_nearest_rows(queries: Tensor, points: Tensor, k: int) -> Tensor:
     return _search(queries, points, k)
 
 
+@torch.no_grad()
+def nearest_features(features: Tensor, k: int) -> Tensor:
+    """Return the rows of the k nearest points of every point in the space of features.
+
+    On a CPU, compiled loops compare differences. On other devices, a matrix product is faster for
+    many channels; its cancellation can swap neighbours that are nearly as near.
+
+    Args:
+        features: ``(B, N, C)``.
+        k: number of neighbours, the point itself included; N if there are fewer.
+
+    Returns:
+        ``(B, N, k)`` int64, nearest first.
+    """
+    k = min(k, features.shape[1])
+    if not torch.compiler.is_compiling():  # a graph cannot contain compiled loops
+        rows = compiled.nearest(features, features, k)
+        if rows is not None:
+            return rows
+    return torch.cdist(features, features).topk(k, largest=False).indices
+
+
 def chamfer_distance(points: Tensor, others: Tensor) -> Tensor:
     """Return the squared chamfer distance: the sum of the mean over both directions.
 
