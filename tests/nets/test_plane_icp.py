@@ -6,7 +6,7 @@ import torch
 from torch.testing import assert_close
 
 from mops_lightning.errors import UserError
-from mops_lightning.nets.plane_icp import PlaneICP, nearest_rows, surface_normals, weighted_step
+from mops_lightning.nets.plane_icp import PlaneICP, surface_normals, weighted_step
 from mops_lightning.ops.rigid import identity_motion, motion_of_vectors, rotation_angle
 from tests.ops.test_stability import box
 
@@ -158,16 +158,6 @@ def test_normals_of_a_plane_are_its_direction():
     (normals,) = surface_normals(plane)
 
     assert normals[:, 2].abs().numpy() == pytest.approx(1)
-
-
-def test_nearest_rows_of_moved_points_are_the_points_themselves(rand):
-    points = rand(2, 40, 3)
-
-    rows, distance = nearest_rows(points + 1e-4, points)
-
-    every_row = list(range(40))
-    assert rows.tolist() == [every_row, every_row]
-    assert distance.max() < 1e-3
 
 
 @pytest.mark.parametrize("distance", [0.0, -1.0, float("inf"), float("nan")])

@@ -5,6 +5,7 @@ import torch
 from torch import Tensor, nn
 
 from mops_lightning.errors import UserError, check_at_least
+from mops_lightning.ops.nearest import nearest
 from mops_lightning.ops.normals import NEIGHBOURS, estimate_normals
 from mops_lightning.ops.points import gather_points
 from mops_lightning.ops.rigid import Motion, identity_motion, motion_of_vectors
@@ -60,13 +61,14 @@ class PlaneICP(nn.Module):
             normals: ``(B, N, 3)`` of the target.
         """
         moved = motion.apply(source)
-        rows, distance = nearest_rows(moved, target)
+        with torch.no_grad():
+            squared, rows = nearest(moved, target)
         across = gather_points(normals, rows)
         apart = moved - gather_points(target, rows)
         residuals = (apart * across).sum(2)
         turns = torch.linalg.cross(moved, across)
         levers = torch.cat([turns, across], 2)
-        is_near = (distance <= self.max_distance).to(moved)
+        is_near = (squared.sqrt() <= self.max_distance).to(moved)
         step = weighted_step(levers.double(), residuals.double(), is_near.double())
         step = step.to(moved)
         turn = step[:, :3]
@@ -88,18 +90,6 @@ def weighted_step(levers: Tensor, residuals: Tensor, weights: Tensor) -> Tensor:
     pull = weighted.mT @ residuals[..., None]
     solution = torch.linalg.solve(matrix, pull)
     return -solution[..., 0]
-
-
-@torch.no_grad()
-def nearest_rows(points: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the rows ``(B, M)`` of the nearest target points, and their distances ``(B, M)``.
-
-    Args:
-        points: ``(B, M, 3)``.
-        target: ``(B, N, 3)``.
-    """
-    distance, rows = torch.cdist(points, target).min(2)
-    return rows, distance
 
 
 @torch.no_grad()

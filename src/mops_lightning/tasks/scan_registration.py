@@ -11,7 +11,8 @@ from mops_lightning.channels import coordinates
 from mops_lightning.errors import UserError, check_at_least
 from mops_lightning.metrics import registration
 from mops_lightning.metrics.base import collection
-from mops_lightning.nets.plane_icp import nearest_rows, surface_normals
+from mops_lightning.nets.plane_icp import surface_normals
+from mops_lightning.ops.nearest import nearest
 from mops_lightning.ops.points import gather_points
 from mops_lightning.ops.rigid import Motion, motion_of_vectors
 from mops_lightning.tasks.registration import Registration
@@ -135,10 +136,10 @@ class ScanRegistration(Registration):
 
     def _residuals(self, clouds: Tensor, motion: Motion, others: Tensor, normals: Tensor) -> Tensor:
         """Return the residuals ``(B, N)`` for the correspondences after one motion."""
-        rows, distance = nearest_rows(motion.apply(clouds), others)
+        squared, rows = nearest(motion.apply(clouds), others)
         apart = clouds - gather_points(others, rows)
         across = (apart * gather_points(normals, rows)).sum(2)
-        is_near = distance <= self.max_distance
+        is_near = squared.sqrt() <= self.max_distance
         return across.abs().where(is_near, self.max_distance)
 
     def metrics(self, training: bool = False) -> MetricCollection:
