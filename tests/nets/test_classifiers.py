@@ -10,8 +10,6 @@ from torch.testing import assert_close
 from mops_lightning.nets.dgcnn import DGCNN
 from mops_lightning.nets.hierarchical import HierarchicalNet, HierarchicalSegmentation
 from mops_lightning.nets.pointnet import PointNetTransform, PointNetVanilla, TransformNet
-from mops_lightning.ops import compiled
-from mops_lightning.ops.maxima import max_of_rows
 from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.fps import FPSSampler
 
@@ -105,19 +103,3 @@ def test_dgcnn_neighbours_are_found_in_the_space_of_features(randn):
         outputs.append(features)
     pooled = net.pool(torch.cat(outputs, 2))
     assert_close(logits, net.head(pooled), atol=1e-5, rtol=1e-4)
-
-
-def test_max_of_rows_equals_maximum_of_gathered_rows(rng, randn, monkeypatch):
-    monkeypatch.setattr(compiled, "THREADS_MIN_WORK", 1)
-    monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
-    features = randn(2, 20, 6, requires_grad=True)
-    rows = torch.randint(20, (2, 9, 4), generator=rng)
-
-    maxima = max_of_rows(features, rows)
-
-    expected = gather_points(features, rows).amax(2)
-    assert_close(maxima, expected)
-    direction = randn(maxima.shape)
-    gradient = torch.autograd.grad(maxima, features, direction)
-    expected_gradient = torch.autograd.grad(expected, features, direction)
-    assert_close(gradient, expected_gradient)

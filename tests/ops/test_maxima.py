@@ -10,7 +10,8 @@ from mops_lightning.ops.points import gather_points
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
 def test_max_of_points_equals_amax_and_so_do_its_gradients(dtype, randn):
-    features = randn(3, 50, 7).to(dtype).requires_grad_()
+    without_ties = randn(3, 50, 7).argsort(1)  # tied points share the gradient of amax
+    features = without_ties.to(dtype).requires_grad_()
     given = randn(3, 7).to(dtype)
 
     largest = max_of_points(features)
@@ -63,4 +64,24 @@ def test_max_of_rows_without_compiled_loops_is_that_of_gathered_rows(rng, randn,
     direction = randn(maxima.shape)
     (gradient,) = torch.autograd.grad(maxima, features, direction)
     (expected_gradient,) = torch.autograd.grad(expected, features, direction)
+    torch.testing.assert_close(gradient, expected_gradient)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.float16, torch.bfloat16])
+def test_max_of_rows_equals_that_of_gathered_rows(dtype, rng, randn, monkeypatch):
+    monkeypatch.setattr(compiled, "THREADS_MIN_WORK", 1)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
+    features = randn(3, 20, 6).to(dtype).requires_grad_()
+    rows = torch.randint(20, (3, 9, 4), generator=rng)
+
+    maxima = max_of_rows(features, rows)
+
+    gathered = gather_points(features, rows)
+    assert maxima.dtype == dtype
+    assert maxima.equal(gathered.amax(2))
+    winners = gathered.argmax(2, keepdim=True)
+    direction = randn(maxima.shape).to(dtype)
+    (gradient,) = torch.autograd.grad(maxima, features, direction)
+    of_winners = gathered.gather(2, winners)[:, :, 0]
+    (expected_gradient,) = torch.autograd.grad(of_winners, features, direction)
     torch.testing.assert_close(gradient, expected_gradient)

@@ -147,7 +147,7 @@ def winners(features: Tensor, rows: Tensor) -> Tensor | None:
     if features.device.type != "cpu" or features.numel() == 0:
         return None
     if features.dtype.itemsize < 4:
-        return None
+        features = features.float()  # numba has no such numbers
     clouds, m, _ = rows.shape
     largest = torch.empty(clouds, m, features.shape[2], dtype=torch.int64, device="cpu")
     arrays = [part.detach().contiguous().numpy() for part in (features, rows, largest)]
