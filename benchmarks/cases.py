@@ -20,6 +20,7 @@ from mops_lightning.ops.nearest import (
     k_nearest,
     nearest,
     nearest_features,
+    search_by_product,
     search_in_blocks,
 )
 from mops_lightning.ops.readout import complete, match
@@ -301,16 +302,11 @@ def features(peak: dict[str, float], rounds: int) -> list[Row]:
             known = torch.randn(8, number, channels, generator=torch.Generator().manual_seed(0))
             calls: Calls = {
                 "16 nearest features": partial(nearest_features, known, 16),
-                "by a matrix product": partial(_by_product, known, 16),
+                "by a matrix product": partial(search_by_product, known, 16),
             }
             names = {"N": number, "channels": channels}
             rows += _rows("search", calls, names, rounds, peak, clouds=8)
     return rows
-
-
-def _by_product(known: Tensor, k: int) -> Tensor:
-    """Find nearest features as other devices do."""
-    return torch.cdist(known, known).topk(k, largest=False).indices
 
 
 def growth(peak: dict[str, float], rounds: int) -> list[Row]:

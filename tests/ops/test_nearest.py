@@ -174,6 +174,16 @@ def test_nearest_shape_mismatch_raises(shape_of_queries, shape_of_points):
         nearest(queries, points)
 
 
+def test_nearest_of_moved_points_are_the_points_themselves(rand):
+    points = rand(2, 40, 3)
+
+    squared, rows = nearest(points + 1e-4, points)
+
+    every_row = list(range(40))
+    assert rows.tolist() == [every_row, every_row]
+    assert squared.sqrt().max() < 1e-3
+
+
 @pytest.mark.parametrize(("shape_of_queries", "shape_of_points"), MISMATCHES)
 def test_k_nearest_shape_mismatch_raises(shape_of_queries, shape_of_points):
     queries = torch.zeros(shape_of_queries)

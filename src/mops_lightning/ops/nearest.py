@@ -98,6 +98,11 @@ def nearest_features(features: Tensor, k: int) -> Tensor:
         rows = compiled.nearest(features, features, k)
         if rows is not None:
             return rows
+    return search_by_product(features, k)
+
+
+def search_by_product(features: Tensor, k: int) -> Tensor:
+    """Find nearest features in torch; arguments as for ``nearest_features``, k at most N."""
     return torch.cdist(features, features).topk(k, largest=False).indices
 
 
