@@ -14,7 +14,7 @@ from mops_lightning.samplers.base import Sampler
 from mops_lightning.types import SampleOutput
 
 from .edge_net import EdgeEmbedding, NeighbourAttention
-from .selector import straight_through
+from .selector import candidate_rows, straight_through
 
 STAGES = 2
 
@@ -57,8 +57,9 @@ class APES(Sampler):
     computed: ``local``, from every point over its k nearest points in the space of the features,
     whose weights' standard deviation is the point's score; or ``global``, over the cloud, where the
     score is the sum of a point's column. The points with the largest scores are kept, with the
-    attention times the values as their new features. The first stage keeps twice as many points as
-    the second, as in the published classifier.
+    attention times the values as their new features; in the local variant, these are values of the
+    differences from the point. The first stage keeps twice as many points as the second, as in the
+    published classifier.
 
     Differences from the publication: there, the stages are inside a classifier, which gets the
     features; here, they select input points for a task net. In training, a selected point has the
@@ -69,6 +70,8 @@ class APES(Sampler):
         m: number of points to select.
         variant: ``local`` or ``global``.
         alpha: weight of the simplification loss.
+        farthest: choose among 4m farthest points, whose features are those in the whole cloud, as
+            by an option of the code of SAMBLE, which has APES, too; otherwise among all points.
         k: number of neighbours.
         channels: channels of the features.
         heads: heads of the attention to neighbours.
@@ -82,6 +85,7 @@ class APES(Sampler):
         m: int,
         variant: Literal["local", "global"] = "local",
         alpha: float = 0.0,
+        farthest: bool = True,
         k: int = 32,
         channels: int = 128,
         heads: int = 4,
@@ -94,6 +98,8 @@ class APES(Sampler):
         check_at_least(2, channels=channels)
         check_at_least(1, heads=heads)
         self.alpha = alpha
+        self.variant = variant
+        self.farthest = farthest
         self.embedding = EdgeEmbedding((128, 128), channels, k)
         self.attention = nn.ModuleList(
             NeighbourAttention(channels, heads, 4, k) for _ in range(STAGES)
@@ -103,24 +109,48 @@ class APES(Sampler):
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Select points; see ``Sampler.forward``."""
-        features = self.attention[0](self.embedding(points))
         kept = min(2 * m, points.shape[1])
+        candidates = candidate_rows(points, kept, self.farthest)
+        features = self.attention[0](self.embedding(points))
+        features = gather_points(features, candidates)
+        remaining = gather_points(points, candidates)
         scores, weights, near = self.sampling[0](features)
         first = scores.topk(kept).indices
-        means = _attended(points, weights, near, first)
-        features = _attended(self.values(features), weights, near, first)
+        means = _attended(remaining, weights, near, first)
+        features = self.attended_values(features, weights, near, first)
 
         features = self.attention[1](features)
-        soft = straight_through(gather_points(points, first), means)
+        soft = straight_through(gather_points(remaining, first), means)
         scores, weights, near = self.sampling[1](features)
         second = scores.topk(m).indices
         means = _attended(soft, weights, near, second)
 
-        rows = first.gather(1, second)
+        rows = candidates.gather(1, first.gather(1, second))
         chosen = gather_points(points, rows)
         if not self.training:
             return SampleOutput(chosen, rows, {})
         return SampleOutput(chosen, rows, {}, soft_projected=straight_through(chosen, means))
+
+    def attended_values(
+        self, features: Tensor, weights: Tensor, near: Tensor, rows: Tensor
+    ) -> Tensor:
+        """Return the features ``(B, M, C)`` of the points that the first stage keeps.
+
+        They are the attention of a point times the values: of the neighbours' differences from it
+        in the local variant, of all points in the global one.
+
+        Args:
+            features: ``(B, N, C)``.
+            weights: ``(B, N, K)`` attention of every point.
+            near: ``(B, N, K)`` the rows that it is for.
+            rows: ``(B, M)`` the points.
+        """
+        values = self.values(features)
+        attended = _attended(values, weights, near, rows)
+        if self.variant == "global":
+            return attended
+        # The weights of a point have sum 1.
+        return attended - gather_points(values, rows)
 
     def losses(
         self, points: Tensor, output: SampleOutput, sizes: Sequence[int]

@@ -11,7 +11,7 @@ from mops_lightning.samplers.ordering import point_hashes
 from mops_lightning.types import SampleOutput
 
 from .edge_net import EdgeEmbedding, NeighbourAttention, neighbour_mask
-from .selector import straight_through
+from .selector import candidate_rows, straight_through
 
 STAGES = 2
 SMALL = 1e-8
@@ -182,6 +182,8 @@ class SAMBLE(Sampler):
 
     Args:
         m: number of points to select.
+        farthest: choose among 4m farthest points, whose features are those in the whole cloud, as
+            by an option of the published code; otherwise among all points.
         k: number of neighbours.
         bins: number of bins.
         temperature: of the choice within a bin.
@@ -196,6 +198,7 @@ class SAMBLE(Sampler):
     def __init__(
         self,
         m: int,
+        farthest: bool = True,
         k: int = 32,
         bins: int = 6,
         temperature: float = 0.1,
@@ -208,6 +211,7 @@ class SAMBLE(Sampler):
         check_at_least(1e-3, temperature=temperature)
         check_at_least(0, momentum=momentum)
         check_at_least(1, heads=heads)
+        self.farthest = farthest
         self.embedding = EdgeEmbedding((64, 64), channels, k)
         self.attention = nn.ModuleList(
             NeighbourAttention(channels, heads, 4, k) for _ in range(STAGES)
@@ -219,20 +223,22 @@ class SAMBLE(Sampler):
 
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Select points; see ``Sampler.forward``."""
-        features = self.attention[0](self.embedding(points))
         kept = min(2 * m, points.shape[1])
-        first, attention = self.sampling[0](features, self._noise(points), kept)
-        means = _attended(points, attention, first)
+        rows = candidate_rows(points, kept, self.farthest)
+        features = gather_points(self.attention[0](self.embedding(points)), rows)
+        candidates = gather_points(points, rows)
+        first, attention = self.sampling[0](features, self._noise(candidates), kept)
+        means = _attended(candidates, attention, first)
         tokens = self.tokens_of_first_stage(len(points))
         features = _attended(self.values(torch.cat([features, tokens], 1)), attention, first)
 
         features = self.attention[1](features)
-        remaining = gather_points(points, first)
+        remaining = gather_points(candidates, first)
         soft = straight_through(remaining, means)
         second, attention = self.sampling[1](features, self._noise(remaining), m)
         means = _attended(soft, attention, second)
 
-        rows = first.gather(1, second)
+        rows = rows.gather(1, first.gather(1, second))
         chosen = gather_points(points, rows)
         if not self.training:
             return SampleOutput(chosen, rows, {})

@@ -1,7 +1,25 @@
-"""What samplers that select points by scores share: gradients of a selection."""
+"""What samplers that select points by scores share: candidates, and gradients of a selection."""
 
 import torch
 from torch import Tensor
+
+from mops_lightning.ops.farthest import FARTHEST
+from mops_lightning.samplers.fps import farthest_rows
+
+
+def candidate_rows(points: Tensor, kept: int, farthest: bool) -> Tensor:
+    """Return the rows ``(B, K)`` of the points among which a stage chooses.
+
+    Args:
+        points: ``(B, N, 3)``.
+        kept: number of points that the stage keeps.
+        farthest: choose among twice as many farthest points, if there are more points than these;
+            otherwise among all.
+    """
+    clouds, n, _ = points.shape
+    if farthest and 2 * kept < n:
+        return farthest_rows(points, 2 * kept, start=FARTHEST)
+    return torch.arange(n, device=points.device).expand(clouds, n)
 
 
 def straight_through(chosen: Tensor, means: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ from torch.testing import assert_close
 import mops_lightning.config.compose  # noqa: F401  registers the resolvers
 from mops_lightning.config.build import build
 from mops_lightning.config.groups import conf_dir
+from mops_lightning.samplers.fps import FPSSampler
 
 # From the root, as sampler=NAME finds them.
 lightn = import_module("benchmarks.rivals.lightn")
@@ -33,7 +34,9 @@ CHOICES = {
     "csnet": ["sampler=csnet"],
     "apes": ["sampler=apes"],
     "apes-global": ["sampler=apes", "sampler.variant=global"],
+    "apes-all": ["sampler=apes", "sampler.farthest=false"],
     "samble": ["sampler=samble"],
+    "samble-all": ["sampler=samble", "sampler.farthest=false"],
 }
 
 
@@ -158,17 +161,48 @@ def test_neighbour_attention_equals_plain_heads_over_differences(randn):
         assert_close(attended[i], expected, atol=1e-5, rtol=1e-5)
 
 
-def test_apes_selects_from_all_points_in_two_stages(randn):
+@pytest.mark.parametrize("name", ["apes", "samble"])
+def test_selection_is_from_all_points_without_farthest(name, randn):
     points = randn(2, 200, 3)
-    sampler = apes.APES(5, k=4, channels=16).eval()
+    sampler = composed([f"sampler={name}", "sampler.farthest=false"]).eval()
 
     output = sampler(points)
 
     first_rows, second_rows = output.indices
     assert output.indices.max() > 100
-    assert len(first_rows.unique()) == 5
-    assert len(second_rows.unique()) == 5
+    assert len(first_rows.unique()) == 6
+    assert len(second_rows.unique()) == 6
     assert_close(output.points[1], points[1][second_rows])
+
+
+@pytest.mark.parametrize("name", ["apes", "samble"])
+def test_selection_is_from_four_times_as_many_farthest_points(name, randn):
+    points = randn(2, 200, 3)
+    sampler = composed([f"sampler={name}"]).eval()
+    candidates = FPSSampler(24, start="farthest")(points).indices
+
+    output = sampler(points)
+
+    for rows, allowed in zip(output.indices, candidates, strict=True):
+        assert len(rows.unique()) == 6
+        assert torch.isin(rows, allowed).all()
+
+
+@pytest.mark.parametrize("variant", ["local", "global"])
+def test_apes_gives_kept_points_the_attended_values(variant, randn):
+    features = randn(9, 8)
+    sampler = apes.APES(2, variant, k=4, channels=8)
+    _, weights, near = sampler.sampling[0](features[None])
+    kept = torch.tensor([[7, 0, 3]])
+
+    (attended,) = sampler.attended_values(features[None], weights, near, kept)
+
+    for found, i in zip(attended, kept[0], strict=True):
+        seen = features[near[0, i]]
+        if variant == "local":
+            seen = seen - features[i]
+        expected = weights[0, i] @ sampler.values(seen)
+        assert_close(found, expected, atol=1e-5, rtol=1e-5)
 
 
 def test_samble_scores_equal_plain_columns_over_neighbours(rand):
