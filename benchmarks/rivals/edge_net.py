@@ -1,12 +1,15 @@
 """The feature net of APES and SAMBLE: edge convolutions, then attention to neighbours.
 
-Neighbours are the k nearest points in the space of the current features, as published.
+Neighbours are the k nearest points in the space of the current features, as published. In mixed
+precision, the layers of edges and the feed-forward nets are in half precision, as wide layers of
+MOPS-Net are; differences from a point and attention are in full precision.
 """
 
 import torch
 from torch import Tensor, nn
 
 from mops_lightning.ops.nearest import nearest_features
+from mops_lightning.ops.precision import pointwise_autocast
 
 SLOPE = 0.2
 """Of the leaky ReLU."""
@@ -60,7 +63,9 @@ class EdgeConvolution(nn.Module):
         neighbour = nn.functional.linear(features, of_difference)
         near = gather_features(neighbour, nearest_features(features, self.k))
         edges = own[:, :, None] + near
-        return self.rest(edges.flatten(0, 2)).unflatten(0, edges.shape[:3]).max(2).values
+        with pointwise_autocast(features.device.type):
+            mapped = self.rest(edges.flatten(0, 2)).unflatten(0, edges.shape[:3])
+        return mapped.max(2).values.to(features)
 
 
 class EdgeEmbedding(nn.Module):
@@ -115,7 +120,9 @@ class NeighbourAttention(nn.Module):
         """Map ``(B, N, channels)`` to ``(B, N, channels)``."""
         mixed = (features + self.attend(features)).flatten(0, 1)
         mixed = self.attention_norm(mixed)
-        result = self.feed_forward_norm(mixed + self.feed_forward(mixed))
+        with pointwise_autocast(features.device.type):
+            correction = self.feed_forward(mixed)
+        result = self.feed_forward_norm(mixed + correction)
         return result.view_as(features)
 
     def attend(self, features: Tensor) -> Tensor:
