@@ -4,7 +4,7 @@
 # A PyntCloud holds the DataFrame that it is made of, not a copy, and to_file converts every float64
 # column of it to float32 before it writes, in each format that can be written. Seen: after saving
 # one point at (500000.123, 5400000.456) with a GPS time as text, .npz, .obj or .bin, the table that
-# the caller still holds says (500000.125, 5400000.5), and the time has lost up to four seconds.
+# the caller still holds says (500000.125, 5400000.5), and the time has lost 3.75 seconds.
 #
 # Exit status 0: this still happens. 1: it has changed.
 set -euo pipefail

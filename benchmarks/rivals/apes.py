@@ -149,7 +149,7 @@ class APES(Sampler):
         attended = _attended(values, weights, near, rows)
         if self.variant == "global":
             return attended
-        # The weights of a point have sum 1.
+        # The weights of a point have sum 1, so that its own values are subtracted once.
         return attended - gather_points(values, rows)
 
     def losses(

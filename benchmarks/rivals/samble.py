@@ -224,21 +224,22 @@ class SAMBLE(Sampler):
     def sample(self, points: Tensor, m: int) -> SampleOutput:
         """Select points; see ``Sampler.forward``."""
         kept = min(2 * m, points.shape[1])
-        rows = candidate_rows(points, kept, self.farthest)
-        features = gather_points(self.attention[0](self.embedding(points)), rows)
-        candidates = gather_points(points, rows)
-        first, attention = self.sampling[0](features, self._noise(candidates), kept)
-        means = _attended(candidates, attention, first)
+        candidates = candidate_rows(points, kept, self.farthest)
+        features = self.attention[0](self.embedding(points))
+        features = gather_points(features, candidates)
+        remaining = gather_points(points, candidates)
+        first, attention = self.sampling[0](features, self._noise(remaining), kept)
+        means = _attended(remaining, attention, first)
         tokens = self.tokens_of_first_stage(len(points))
         features = _attended(self.values(torch.cat([features, tokens], 1)), attention, first)
 
         features = self.attention[1](features)
-        remaining = gather_points(candidates, first)
+        remaining = gather_points(remaining, first)
         soft = straight_through(remaining, means)
         second, attention = self.sampling[1](features, self._noise(remaining), m)
         means = _attended(soft, attention, second)
 
-        rows = rows.gather(1, first.gather(1, second))
+        rows = candidates.gather(1, first.gather(1, second))
         chosen = gather_points(points, rows)
         if not self.training:
             return SampleOutput(chosen, rows, {})

@@ -9,6 +9,7 @@ from torch.testing import assert_close
 import mops_lightning.config.compose  # noqa: F401  registers the resolvers
 from mops_lightning.config.build import build
 from mops_lightning.config.groups import conf_dir
+from mops_lightning.ops.precision import restrict_autocast_to_pointwise
 from mops_lightning.samplers.fps import FPSSampler
 
 # From the root, as sampler=NAME finds them.
@@ -139,6 +140,20 @@ def test_edge_convolution_equals_plain_maximum_over_neighbours(randn):
             edges.append(torch.cat([centre, difference]))
         values = layer.rest(layer.first(torch.stack(edges)))
         assert_close(convolved[i], values.max(0).values)
+
+
+def test_edge_net_in_mixed_precision_is_close_to_full_precision(randn):
+    points = randn(2, 40, 3)
+    embedding = edge_net.EdgeEmbedding((16, 16), 8, k=4).eval()
+    attention = edge_net.NeighbourAttention(8, heads=2, expansion=4, k=4).eval()
+    expected = attention(embedding(points))
+
+    with torch.autocast("cpu", torch.bfloat16), restrict_autocast_to_pointwise("cpu"):
+        mixed = attention(embedding(points))
+
+    assert mixed.dtype == torch.float32
+    assert not torch.equal(mixed, expected)
+    assert_close(mixed, expected, atol=0.05, rtol=0.05)
 
 
 def test_neighbour_attention_equals_plain_heads_over_differences(randn):
