@@ -88,6 +88,14 @@ def test_self_correlation_equals_plain_sums(randn):
         assert_close(found, weighted.sum(0) / shares.sum())
 
 
+def test_offset_attention_equals_plain_attention(randn):
+    features = randn(2, 40, 8)
+    net = csnet.OffsetAttention(8)
+    queries, keys, values = net.projections(features).chunk(3, 2)
+    attended = (queries @ keys.mT / 8**0.5).softmax(2) @ values
+    assert_close(net(features), features + net.offset(features - attended))
+
+
 def test_soft_top_k_is_sigmoid_above_threshold_that_gives_k(randn):
     scores = randn(40)
     low = -50.0
