@@ -2,9 +2,10 @@
 # point-cloud-utils 0.34.0's removal of duplicates keeps close pairs and removes distant ones.
 #
 # deduplicate_point_cloud(points, epsilon) says that two points are the same if their distance is
-# below epsilon. It rounds coordinates to multiples of epsilon instead, so that it depends on where a pair lies. Seen:
-# with epsilon 1, points at x = 0.4 and 0.6 both stay, and of (0.55, 0.55, 0.55) and (1.45, 1.45, 1.45), 1.56 apart, one goes.
-# Of 1,000 random pairs a tenth of epsilon apart, 141 are still two. (A single point comes back as an array (3,).)
+# below epsilon. It rounds coordinates to multiples of epsilon instead, so that it depends on where
+# a pair lies. Seen: with epsilon 1, points at x = 0.4 and 0.6 both stay, and of (0.55, 0.55, 0.55)
+# and (1.45, 1.45, 1.45), 1.56 apart, one goes. Of 1,000 random pairs a tenth of epsilon apart, 141
+# are still two. (A single point comes back as an array (3,).)
 #
 # Exit status 0: this still happens. 1: it has changed.
 set -euo pipefail
@@ -19,7 +20,9 @@ import point_cloud_utils
 
 def kept(points, epsilon):
     """Return how many of the points are kept."""
-    result = point_cloud_utils.deduplicate_point_cloud(numpy.asarray(points, numpy.float64), epsilon)[0]
+    result = point_cloud_utils.deduplicate_point_cloud(
+        numpy.asarray(points, numpy.float64), epsilon
+    )[0]
     return result.size // 3  # a single point comes back without its first axis
 
 

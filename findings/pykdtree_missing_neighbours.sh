@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# pykdtree 1.4.3 answers with an index beyond every array and a finite distance where a neighbour is missing.
+# pykdtree 1.4.3 gives a missing neighbour a finite distance, and an index beyond every array.
 #
-# Its README says that it is used as SciPy's cKDTree, which gives the distance inf and the index n where fewer than k
-# points are there. Seen: for k=3 and two points, pykdtree's third distance is 1.3e154 and its index 4294967295, so
-# that tests for inf or for the index n find nothing, and means of distances explode. With a
-# distance_upper_bound it answers with inf and n, as SciPy does.
+# Its README says that it is used as SciPy's cKDTree, which gives the distance inf and the index n
+# where fewer than k points are there. Seen: for k=3 and two points, pykdtree's third distance is
+# 1.3e154 and its index 4294967295, so that tests for inf or for the index n find nothing, and means
+# of distances explode. With a distance_upper_bound it answers with inf and n, as SciPy does.
 #
 # Exit status 0: this still happens. 1: it has changed.
 set -euo pipefail
