@@ -13,7 +13,7 @@ from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.types import SampleOutput
 
-from .edge_net import EdgeEmbedding, NeighbourAttention
+from .edge_net import EdgeEmbedding, NeighbourAttention, check_channels
 from .selector import candidate_rows, straight_through
 
 STAGES = 2
@@ -95,8 +95,7 @@ class APES(Sampler):
             raise UserError(f"variant must be local or global, got {variant!r}.")
         check_at_least(0, alpha=alpha)
         check_at_least(2, k=k)
-        check_at_least(2, channels=channels)
-        check_at_least(1, heads=heads)
+        check_channels(channels, heads)
         self.alpha = alpha
         self.variant = variant
         self.farthest = farthest

@@ -8,6 +8,7 @@ MOPS-Net are; differences from a point and attention are in full precision.
 import torch
 from torch import Tensor, nn
 
+from mops_lightning.errors import UserError, check_at_least
 from mops_lightning.ops.nearest import nearest_features
 from mops_lightning.ops.precision import pointwise_autocast
 
@@ -66,6 +67,18 @@ class EdgeConvolution(nn.Module):
         with pointwise_autocast(features.device.type):
             mapped = self.rest(edges.flatten(0, 2)).unflatten(0, edges.shape[:3])
         return mapped.max(2).values.to(features)
+
+
+def check_channels(channels: int, heads: int) -> None:
+    """Reject channels that two convolutions or all heads cannot share equally.
+
+    Raises:
+        UserError: it says which channels are allowed.
+    """
+    check_at_least(2, channels=channels)
+    check_at_least(1, heads=heads)
+    if channels % 2 or channels % heads:
+        raise UserError(f"channels must be even and a multiple of heads={heads}, got {channels}.")
 
 
 class EdgeEmbedding(nn.Module):

@@ -3,14 +3,14 @@
 import torch
 from torch import Tensor, nn
 
-from mops_lightning.errors import check_at_least
+from mops_lightning.errors import UserError, check_at_least
 from mops_lightning.ops.nearest import nearest_features
 from mops_lightning.ops.points import gather_points
 from mops_lightning.samplers.base import Sampler
 from mops_lightning.samplers.ordering import point_hashes
 from mops_lightning.types import SampleOutput
 
-from .edge_net import EdgeEmbedding, NeighbourAttention, neighbour_mask
+from .edge_net import EdgeEmbedding, NeighbourAttention, check_channels, neighbour_mask
 from .selector import candidate_rows, straight_through
 
 STAGES = 2
@@ -207,10 +207,12 @@ class SAMBLE(Sampler):
         heads: int = 4,
     ) -> None:
         super().__init__(m)
-        check_at_least(2, k=k, bins=bins, channels=channels)
+        check_at_least(2, k=k, bins=bins)
+        check_channels(channels, heads)
         check_at_least(1e-3, temperature=temperature)
         check_at_least(0, momentum=momentum)
-        check_at_least(1, heads=heads)
+        if momentum > 1:
+            raise UserError(f"momentum must be at most 1, got {momentum}.")
         self.farthest = farthest
         self.embedding = EdgeEmbedding((64, 64), channels, k)
         self.attention = nn.ModuleList(

@@ -106,6 +106,15 @@ def test_mistake_in_a_file_ends_in_one_line(name, content, said, tmp_path):
     assert said in refused(["--config-dir", str(tmp_path), *arguments], tmp_path)
 
 
+def test_mistyped_setting_of_a_sampler_of_ones_own_names_its_settings(tmp_path):
+    (tmp_path / "sampler").mkdir()
+    text = "_target_: mops_lightning.samplers.fps.FPSSampler\nm: ${m}\ntemperature: 1\n"
+    (tmp_path / "sampler" / "mine.yaml").write_text(text)
+    for flag in (["--config-dir", str(tmp_path)], [f"--config-dir={tmp_path}"]):
+        err = refused([*flag, "sampler=mine", "sampler.temprature=2"], tmp_path)
+        assert "no such setting. Did you mean 'sampler.temperature'" in err
+
+
 @pytest.mark.parametrize("name", ["EarlyStopping", "ModelCheckpoint"])
 def test_callback_with_an_unknown_metric_ends_in_one_line(name, tmp_path):
     target = f"+callbacks.mine._target_=lightning.pytorch.callbacks.{name}"

@@ -1,3 +1,4 @@
+import re
 from importlib import import_module
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from torch.testing import assert_close
 import mops_lightning.config.compose  # noqa: F401  registers the resolvers
 from mops_lightning.config.build import build
 from mops_lightning.config.groups import conf_dir
+from mops_lightning.errors import UserError
 from mops_lightning.ops.precision import restrict_autocast_to_pointwise
 from mops_lightning.samplers.fps import FPSSampler
 
@@ -89,11 +91,17 @@ def test_self_correlation_equals_plain_sums(randn):
 
 
 def test_offset_attention_equals_plain_attention(randn):
-    features = randn(2, 40, 8)
+    features = randn(2, 40, 8).requires_grad_()
     net = csnet.OffsetAttention(8)
     queries, keys, values = net.projections(features).chunk(3, 2)
     attended = (queries @ keys.mT / 8**0.5).softmax(2) @ values
-    assert_close(net(features), features + net.offset(features - attended))
+    expected = features + net.offset(features - attended)
+    found = net(features)
+    assert_close(found, expected)
+    weights = [features, *net.parameters()]
+    toward = randn(2, 40, 8)
+    gradients = (torch.autograd.grad(x, weights, toward) for x in (found, expected))
+    assert_close(*gradients)
 
 
 def test_soft_top_k_is_sigmoid_above_threshold_that_gives_k(randn):
@@ -182,6 +190,19 @@ def test_neighbour_attention_equals_plain_heads_over_differences(randn):
             heads.append(logits.softmax(0) @ values[:, channels])
         expected = torch.cat(heads)
         assert_close(attended[i], expected, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"heads": 3}, "channels must be even and a multiple of heads=3, got 128."),
+        ({"channels": 9, "heads": 3}, "channels must be even and a multiple of heads=3, got 9."),
+        ({"momentum": 2.0}, "momentum must be at most 1, got 2.0."),
+    ],
+)
+def test_samble_refuses_arguments_out_of_range(change, message):
+    with pytest.raises(UserError, match=re.escape(message)):
+        samble.SAMBLE(8, **change)
 
 
 @pytest.mark.parametrize("name", ["apes", "samble"])

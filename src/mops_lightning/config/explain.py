@@ -1,8 +1,10 @@
 """Errors of Hydra, OmegaConf and YAML in words: the setting, and the nearest known one."""
 
+import argparse
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError, ValidationError
@@ -220,6 +222,11 @@ def _composed(groups: Sequence[str], arguments: Sequence[str]) -> DictConfig:
         group = key_of(argument).partition("@")[0]
         if group in groups:
             choices.append(argument)
+    flags = argparse.ArgumentParser(add_help=False)
+    flags.add_argument("--config-dir", "-cd", type=Path)
+    own = flags.parse_known_args(arguments)[0].config_dir
+    if own is not None:
+        choices.append(f"hydra.searchpath=['file://{own.absolute()}']")
     try:
         return composed(choices)
     except Exception:  # the mistake may be among them
