@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # meshio 5.3.5 reads unsigned bytes of a binary PLY file as signed ones: red 200 becomes -56.
 #
-# A property uchar, as colours and classes have, becomes int8 if the file is binary, of either byte
+# A property uchar, as colours have, becomes int8 if the file is binary, of either byte
 # order, and uint8 if it is ascii. Under the name uint8, which the format has as well, it is uint8
 # in both. Seen: red 127, 128 and 255 are read as 127, -128 and -1, without a word; written again,
 # they are int8, so that the next reader sees them, too. (Reported there in 2022, pull request

@@ -79,7 +79,7 @@ print(
 )
 raise SystemExit(
     0
-    if 0.1 < off[:, 1].max() < 5 and late > 1 and few == 2**40 and label == 3 and away < 1e-6
+    if 1 < off[:, 1].max() < 3 and late > 100 and few == 2**40 and label == 3 and away < 1e-6
     else 1
 )
 PYTHON
