@@ -222,7 +222,7 @@ def _composed(groups: Sequence[str], arguments: Sequence[str]) -> DictConfig:
         group = key_of(argument).partition("@")[0]
         if group in groups:
             choices.append(argument)
-    flags = argparse.ArgumentParser(add_help=False)
+    flags = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     flags.add_argument("--config-dir", "-cd", type=Path)
     own = flags.parse_known_args(arguments)[0].config_dir
     if own is not None:
