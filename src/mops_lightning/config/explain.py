@@ -222,12 +222,18 @@ def _composed(groups: Sequence[str], arguments: Sequence[str]) -> DictConfig:
         group = key_of(argument).partition("@")[0]
         if group in groups:
             choices.append(argument)
-    flags = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    flags.add_argument("--config-dir", "-cd", type=Path)
-    own = flags.parse_known_args(arguments)[0].config_dir
+    own = _folder_of_ones_own(arguments)
     if own is not None:
         choices.append(f"hydra.searchpath=['file://{own.absolute()}']")
     try:
         return composed(choices)
     except Exception:  # the mistake may be among them
         return composed([])
+
+
+def _folder_of_ones_own(arguments: Sequence[str]) -> Path | None:
+    """Return the folder that ``--config-dir`` names, if it is there."""
+    flags = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    flags.add_argument("--config-dir", "-cd", dest="folder", type=Path)
+    folder: Path | None = flags.parse_known_args(arguments)[0].folder
+    return folder
