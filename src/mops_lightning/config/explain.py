@@ -232,7 +232,7 @@ def _composed(groups: Sequence[str], arguments: Sequence[str]) -> DictConfig:
 
 
 def _folder_of_ones_own(arguments: Sequence[str]) -> Path | None:
-    """Return the folder that ``--config-dir`` names, if it is there."""
+    """Return the folder of ``--config-dir``, if the arguments have this flag."""
     flags = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     flags.add_argument("--config-dir", "-cd", dest="folder", type=Path)
     folder: Path | None = flags.parse_known_args(arguments)[0].folder
