@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from mops_lightning.errors import check_at_least
-from mops_lightning.nets.layers import PointMLP
+from mops_lightning.nets.layers import PointMLP, check_channels
 from mops_lightning.ops.maxima import max_of_rows
 from mops_lightning.ops.nearest import k_nearest
 from mops_lightning.ops.points import gather_points
@@ -90,6 +90,7 @@ class CSNet(Sampler):
         check_at_least(0, alpha=alpha)
         check_at_least(1e-3, epsilon=epsilon, width=width)
         check_at_least(1, k=k, channels=channels)
+        check_channels("feature_channels", feature_channels)
         self.alpha = alpha
         self.epsilon = epsilon
         self.width = width

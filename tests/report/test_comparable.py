@@ -129,7 +129,10 @@ def test_other_commit_has_table_of_its_own_unless_mixed(tmp_path):
 
     edited(path, git={"commit": "f" * 40, "dirty": False})
 
-    assert "commit ffffffffff)" in endings(table(tmp_path))
+    text = table(tmp_path)
+    assert "commit ffffffffff)" in endings(text)
+    assert "2 groups of runs are not comparable" in text
+    assert "--mixed joins groups that differ in commit or settings only." in text
     assert len(rows(table(tmp_path, mixed=True))) == 3
 
 

@@ -205,6 +205,12 @@ def test_samble_refuses_arguments_out_of_range(change, message):
         samble.SAMBLE(8, **change)
 
 
+def test_csnet_refuses_to_have_no_layer():
+    message = "feature_channels must be sizes of at least 1 layer, each at least 1, got []."
+    with pytest.raises(UserError, match=re.escape(message)):
+        csnet.CSNet(8, feature_channels=[])
+
+
 @pytest.mark.parametrize("name", ["apes", "samble"])
 def test_selection_is_from_all_points_without_farthest(name, randn):
     points = randn(2, 200, 3)

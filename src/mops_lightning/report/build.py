@@ -13,10 +13,9 @@ from mops_lightning.report.provenance import collapses, edited, provenance, with
 from mops_lightning.report.tables import Table, make_table
 from mops_lightning.report.text import Grid
 
-NOT_COMPARABLE = (
-    "{} groups of runs are not comparable and have tables of their own. "
-    "--mixed joins groups that differ in commit or settings only."
-)
+NOT_COMPARABLE = "{} groups of runs are not comparable and have tables of their own."
+
+MIXED_JOINS = " --mixed joins groups that differ in commit or settings only."
 
 
 @dataclass(frozen=True)
@@ -53,15 +52,20 @@ def build_report(folder: Path, metrics: Iterable[str] = (), mixed: bool = False)
     tables: list[Table] = []
     if of_samplers:
         parts = groups(of_samplers, mixed)
+        joined = groups(of_samplers, mixed=True)
         tables = _tables(parts, wanted, collect.tested_metrics(of_samplers))
         texts = [grid for table in tables for grid in grids(table)]
     else:
         parts = net_groups(found.done, mixed)
+        joined = net_groups(found.done, mixed=True)
         texts = [nets_grid(part, wanted) for part in parts]
     remarks = _about_runs(found, of_samplers or found.done, tables)
     remarks += edited(found.done)
     if len(parts) > 1:
-        remarks += ["", NOT_COMPARABLE.format(len(parts))]
+        apart = NOT_COMPARABLE.format(len(parts))
+        if len(joined) < len(parts):
+            apart += MIXED_JOINS
+        remarks += ["", apart]
     remarks += without_result(found)
     return Report(found, tables, texts, remarks)
 
