@@ -84,6 +84,9 @@ task=registration sampler=mops: recipe.feature_distillation=1.0
 task=registration sampler=fmops: weights=auto pretrain_from=pcrnet.modelnet40 optimizer.lr=0.005
 task=registration sampler=fmops recipe=paper: sampler.anchors=None sampler.m_max=64
 task=registration sampler=fmops recipe=paper: optimizer.lr=0.001
+task=registration: recipe.train_points=256 recipe.task_points=128
+task=registration recipe=paper: recipe.train_points=None recipe.task_points=None
+task=registration dataset=modelnet40: recipe.train_points=512 recipe.task_points=None
 task=reconstruction: sampler.alpha=0.2 sampler.tau_min=0.5
 task=reconstruction: names.net=autoencoder
 task=segmentation: names.net=hierarchical_segmentation task.net.sampler.m=32

@@ -72,14 +72,13 @@ dataset_task/shapes_classification: epochs.task=12 epochs.sampler=10
 dataset_task/shapes_reconstruction: epochs.task=60 epochs.sampler=10
 dataset_task/shapes_registration: weights=auto pretrain_from=pcrnet.modelnet40 pretrain.lr=0.0005
 dataset_task/shapes_registration: val_fraction=0.0125 epochs.task=6 epochs.sampler=6
-dataset_task/shapes_registration: recipe.train_points=256 recipe.task_points=128
 dataset_task/shapes_registration: dataset.classes=asymmetric dataset.train_per_class=640
 dataset_task/shapes_registration: dataset.test_per_class=40
 dataset_task/shapes_segmentation: dataset.classes=parts epochs.task=30 epochs.sampler=10
 dataset_task/shapes_segmentation: pretrain.lr=0.004
 debug/fdr: trainer.fast_dev_run=True
 debug/overfit: trainer.overfit_batches=2
-debug/profiler: trainer.profiler=simple epochs.task=1 epochs.sampler=1
+debug/profiler: trainer.profiler=simple epochs.task=1 epochs.sampler=1 epochs.joint=1
 experiment/classification_paper: choice0=override/task:classification
 experiment/classification_paper: choice1=override/dataset:modelnet40 choice2=override/sampler:mops
 experiment/classification_paper: choice3=override/optimizer:exponential
@@ -162,7 +161,9 @@ recipe/fast: choice0=paper choice1=_self_ choice2=optionalfast@_here_:${task} tr
 recipe/fast: warm_start=True distillation=3.0 ema_span=0.2
 recipe/fast/classification: task_points=256
 recipe/fast/reconstruction: distillation=0.0
+recipe/fast/registration: choice0=_self_ choice1=optionalregistration@_here_:${dataset}
 recipe/fast/registration: train_points=512 distillation=0.0 feature_distillation=1.0
+recipe/fast/registration/shapes: train_points=256 task_points=128
 sampler/fmops: choice0=_self_ choice1=optionalmops@_here_:${task}
 sampler/fmops: choice2=optionalfmops@_here_:${task}_${oc.select:recipe,none}
 sampler/fmops: choice3=override/optimizer@_global_.optimizer:one_cycle_fmops

@@ -118,7 +118,7 @@ def test_residuals_without_motion_equal_a_plain_form(clouds):
 
     module = task()
 
-    residuals = module.residuals(batch)
+    residuals = module.residuals(batch, batch.points)
 
     source, target = batch.points.chunk(2)
     aligned = start_of(batch).apply(source)
@@ -126,6 +126,19 @@ def test_residuals_without_motion_equal_a_plain_form(clouds):
         expected = plain_residuals(aligned[number], target[number])
         found = residuals[number, 0].double()
         assert_close(found, expected, atol=1e-5, rtol=0)
+
+
+def test_residuals_of_a_part_are_those_in_the_whole_pair(clouds):
+    batch = batch_of(clouds)
+    module = task()
+    rows = torch.arange(0, 200, 3)
+    torch.manual_seed(5)
+    whole = module.residuals(batch, batch.points)
+    torch.manual_seed(5)
+
+    part = module.residuals(batch, batch.points[:, rows])
+
+    assert_close(part, whole[:, :, rows])
 
 
 def turned_about_random_axes(directions, sizes, angle, shift):
@@ -147,7 +160,7 @@ def test_residuals_of_both_halves_follow_motions_that_grow_to_those_of_a_start(c
     batch = batch_of(clouds)
     torch.manual_seed(5)
 
-    residuals = module.residuals(batch)
+    residuals = module.residuals(batch, batch.points)
 
     assert residuals.shape == (6, 4, 200)
     source, target = batch.points.chunk(2)
@@ -221,7 +234,7 @@ def test_loss_is_smallest_at_the_mean_residual(clouds):
     batch = batch_of(clouds)
     module = task()
     state = torch.get_rng_state()
-    mean_residuals = module.residuals(batch).mean(1)
+    mean_residuals = module.residuals(batch, batch.points).mean(1)
     best = mean_residuals.log()
 
     losses = {}
@@ -229,7 +242,7 @@ def test_loss_is_smallest_at_the_mean_residual(clouds):
         torch.set_rng_state(state)
         shifted = best + offset
         output = SampleOutput(batch.points, None, {}, log_residuals=shifted)
-        losses_by_name = module.sample_losses(batch, output)
+        losses_by_name = module.sample_losses(batch, batch.points, output)
         losses[offset] = losses_by_name["residual"].item()
 
     expected = best.mean().item() + 1
@@ -243,7 +256,7 @@ def test_samplers_without_residuals_have_no_such_loss(clouds):
     without_residuals = SampleOutput(batch.points, None, {})
     module = task()
 
-    losses = module.sample_losses(batch, without_residuals)
+    losses = module.sample_losses(batch, batch.points, without_residuals)
 
     assert losses == {}
 

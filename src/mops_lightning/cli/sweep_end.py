@@ -80,8 +80,9 @@ class SweepSummary(Callback):
         """Count the cells of this start by state, and write the report.
 
         Raises:
-            SystemExit: with 1 if a cell failed or the report did. Hydra turns any other exception
-                of a callback into a warning, and ends with 0.
+            SystemExit: with 1 if a cell failed or the report did, with the status of a user's error
+                if the report refuses the runs. Hydra turns any other exception of a callback into
+                a warning, and ends with 0.
         """
         folder = Path(os.path.relpath(config.hydra.sweep.dir))
         try:

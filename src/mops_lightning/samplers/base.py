@@ -84,6 +84,9 @@ class Sampler(nn.Module):
     spreads: bool = True
     """Whether the method spreads the points evenly; random and serial sampling do not."""
 
+    predicts_residuals: bool = False
+    """Whether the method learns residuals of points in registration, and nothing else."""
+
     size_reduction: Literal["mean", "sum"] = "mean"
     """Reduction of the losses at several ``training_sizes`` to one."""
 

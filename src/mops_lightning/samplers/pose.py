@@ -55,6 +55,7 @@ class PoseSampler(Sampler):
     flexible = True
     nested = True
     spreads = False
+    predicts_residuals = True
 
     def __init__(
         self,

@@ -49,6 +49,9 @@ class Task(nn.Module):
     clouds_per_prediction: int = 1
     """Number of clouds that a prediction needs; ``points`` contains all first ones, and so on."""
 
+    knows_residuals: bool = False
+    """Whether ``sample_losses`` trains a sampler to predict residuals."""
+
     def __init__(self, net: nn.Module) -> None:
         super().__init__()
         if not isinstance(net, nn.Module):
@@ -94,12 +97,13 @@ class Task(nn.Module):
         """
         raise NotImplementedError
 
-    def sample_losses(self, batch: Any, output: SampleOutput) -> dict[str, Tensor]:
+    def sample_losses(self, batch: Any, seen: Tensor, output: SampleOutput) -> dict[str, Tensor]:
         """Return losses of what a sampler tells beside its points; none by default.
 
         Args:
             batch: as for ``predict``.
-            output: the sampler's, for the points that it has seen of ``batch.points``.
+            seen: ``(B', K, 3)`` the points of ``batch.points`` that the sampler has seen.
+            output: the sampler's, for these points.
         """
         return {}
 

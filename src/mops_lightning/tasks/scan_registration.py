@@ -45,6 +45,7 @@ class ScanRegistration(Registration):
     """
 
     score = registration.MedianRotationError.name
+    knows_residuals = True
 
     def __init__(
         self,
@@ -102,28 +103,34 @@ class ScanRegistration(Registration):
         motion: Motion = self.net(source, target)
         return motion
 
-    def sample_losses(self, batch: PairBatch, output: SampleOutput) -> dict[str, Tensor]:
+    def sample_losses(
+        self, batch: PairBatch, seen: Tensor, output: SampleOutput
+    ) -> dict[str, Tensor]:
         """Return the loss of predicted residuals; see the class."""
         if output.log_residuals is None:
             return {}
         expected = output.log_residuals
-        found = self.residuals(batch)
+        found = self.residuals(batch, seen)
         precision = (-expected).exp()
         losses = found * precision[:, None] + expected[:, None]
         return {"residual": losses.mean()}
 
     @torch.no_grad()
-    def residuals(self, batch: PairBatch) -> Tensor:
-        """Return the residuals ``(2B, MOTIONS, N)`` of both halves, under drawn motions.
+    def residuals(self, batch: PairBatch, seen: Tensor) -> Tensor:
+        """Return the residuals ``(2B, MOTIONS, K)`` of points of both halves, under drawn motions.
 
         The motions grow from none to those of a start; they are drawn from torch's global
         generator.
+
+        Args:
+            batch: pairs, whose whole halves have the corresponding points.
+            seen: ``(2B, K, 3)`` points of the sources, then of the targets.
         """
         source, target = coordinates(batch.points).chunk(2)
+        seen_source, seen_target = coordinates(seen).chunk(2)
         true = Motion(batch.quaternion, batch.translation)
-        aligned = true.apply(source)
-        clouds = torch.cat([aligned, target])
-        others = torch.cat([target, aligned])
+        clouds = torch.cat([true.apply(seen_source), seen_target])
+        others = torch.cat([target, true.apply(source)])
         normals = surface_normals(others)
         residuals = []
         for number in range(MOTIONS):

@@ -302,7 +302,7 @@ class Experiment(L.LightningModule):
             for name, value in losses.items():
                 share = value / (len(inputs) * len(numbers))
                 terms[name] = terms.get(name, 0) + share
-        return {**terms, **self.task.sample_losses(batch, sampled), **sampled.losses}
+        return {**terms, **self.task.sample_losses(batch, seen, sampled), **sampled.losses}
 
     def _nets_of_step(self) -> list[int]:
         """Return the numbers of the task nets of this step: 0 is the run's own."""

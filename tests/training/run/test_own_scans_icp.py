@@ -55,6 +55,19 @@ def test_record_has_the_loss_and_compares_with_samplers_without_training(folder)
         assert f"test/m10/{method}/median_rotation_error_deg" in record.metrics
 
 
+def test_pose_learns_from_a_part_of_the_points_by_the_default_recipe(folder, tmp_path):
+    settings = ["recipe=fast", "recipe.train_points=24", "m=8", "sampler.m_max=12", "sizes=[8,12]"]
+    scans = f"dataset.root={folder / 'scans'}"
+
+    done([*SETTINGS, *settings, scans], tmp_path)
+
+    (run,) = runs(tmp_path)
+    record = run_record.read(run)
+    assert record.recipe is not None
+    assert record.recipe["train_points"] == 24
+    assert "test/m12/sampled/median_rotation_error_deg" in record.metrics
+
+
 def test_run_can_be_loaded_and_compared_by_icp(folder):
     pytest.importorskip("small_gicp")
     run, _ = runs(folder)

@@ -164,6 +164,11 @@ def test_diverged_training_fails_without_weights(tmp_path):
         (["task.net=null"], r"task.net cannot be removed"),
         (["task.resample=0"], r"task.resample must be .*got 0"),
         (["task.resample=16", "m=24"], r"task.resample"),
+        (
+            ["sampler=pose", "sampler.m_max=16"],
+            r"sampler=pose learns residuals of scans, which only task=icp knows; got "
+            r"task=registration\. Choose task=icp or another sampler\.",
+        ),
     ],
 )
 def test_mistake_fails_before_pretraining(settings, said, tmp_path):
@@ -233,6 +238,13 @@ def test_resume_with_fewer_epochs_than_done_raises(tmp_path):
     assert not same.lengthened
     assert longer.lengthened
     assert len(files(tmp_path, CACHED)) == 1  # not of the longer one
+
+
+def test_shortened_pretraining_says_so_before_it_starts(tmp_path, capsys):
+    train(tmp_path, "sampler=fps", "+trainer.max_steps=1")
+
+    said = "training it first, 1 epoch, shortened by trainer.max_steps=1."
+    assert said in capsys.readouterr().out
 
 
 def test_resumed_pretraining_does_not_warn_about_its_folder(tmp_path, capsys, recwarn):

@@ -64,6 +64,8 @@ def make_experiment(cfg: DictConfig, dataset: CloudDataset, identity: dict[str, 
     if cfg.learn != "task":
         sampler = _make_sampler(cfg.sampler, dataset, task)
         check_sampler(sampler, dataset)
+        if cfg.learn != "nothing":
+            _check_learns(cfg, sampler, task)
     cloud = smallest_cloud((dataset.test, dataset.train), task.make_batch)
     trains = cfg.learn != "nothing"
     sizes = sizes_to_test(cfg.sizes, cfg.m, sampler, cloud.shape[1], training=trains)
@@ -156,6 +158,19 @@ def _check_fits(cfg: DictConfig, dataset: CloudDataset, offered: Mapping[str, in
             "knows. Give jitter, rotation, scaling, shear or distortion."
         )
     check_parts(dataset)
+
+
+def _check_learns(cfg: DictConfig, sampler: Sampler, task: Task) -> None:
+    """Refuse a sampler that learns nothing from the task.
+
+    Raises:
+        UserError: no loss of the task depends on the sampler.
+    """
+    if sampler.predicts_residuals and not task.knows_residuals:
+        raise UserError(
+            f"sampler={cfg.names.sampler} learns residuals of scans, which only task=icp knows; "
+            f"got task={cfg.names.task}. Choose task=icp or another sampler."
+        )
 
 
 def _make_sampler(node: DictConfig, dataset: CloudDataset, task: Task, **size: int) -> Sampler:

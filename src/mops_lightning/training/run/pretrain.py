@@ -75,6 +75,9 @@ def _train(cfg: DictConfig, folder: Path, dataset: CloudDataset) -> None:
     epochs = f"{cfg.epochs.task} epochs"
     if cfg.epochs.task == 1:
         epochs = "1 epoch"
+    shortened = shortening(_plain(cfg))
+    if shortened:
+        epochs += f", shortened by {', '.join(shortened)}"
     print(
         f"No cached weights of {cfg.names.net} for {cfg.names.dataset}: training it "
         f"first, {epochs}. Cache: {folder}",
