@@ -14,20 +14,21 @@ def cover_least_held(squares, orders, m):
     """Choose m points, each for the direction that the points chosen so far hold least.
 
     Args:
-        squares: ``(N, 6)`` what every point adds to the stability of the six directions.
-        orders: ``(6, N)`` the points of every direction, those that add most first.
+        squares: ``(N, D)`` what every point adds to the stability of each of D directions.
+        orders: ``(D, N)`` the points of every direction, those that add most first.
         m: number of points.
 
     Returns:
         ``(m,)`` places, in the order of choice.
     """
-    totals = np.zeros(6)
-    heads = np.zeros(6, np.int64)
+    number = squares.shape[1]
+    totals = np.zeros(number)
+    heads = np.zeros(number, np.int64)
     taken = np.zeros(len(squares), np.bool_)
     chosen = np.empty(m, np.int64)
     for step in range(m):
         weakest = 0
-        for direction in range(1, 6):
+        for direction in range(1, number):
             if totals[direction] < totals[weakest]:
                 weakest = direction
         while taken[orders[weakest, heads[weakest]]]:
@@ -35,7 +36,7 @@ def cover_least_held(squares, orders, m):
         place = orders[weakest, heads[weakest]]
         taken[place] = True
         chosen[step] = place
-        for direction in range(6):
+        for direction in range(number):
             totals[direction] += squares[place, direction]
     return chosen
 

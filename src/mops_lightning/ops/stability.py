@@ -17,6 +17,9 @@ PRIOR = 1e-3
 RIDGE = 1e-2
 """The same for ``steady_places``, where it is the knowledge of the pose before registration."""
 
+HELD = 1e-12
+"""Smallest share of the largest eigenvalue of Σ v vᵀ that is more than rounding."""
+
 ROTATION = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
 """The directions of ``plane_rows`` that turn the points."""
 
@@ -42,11 +45,13 @@ def plane_rows(points: NDArray[np.float64], normals: NDArray[np.float64]) -> NDA
 
 
 def stable_places(rows: NDArray[np.float64], m: int) -> NDArray[np.int64]:
-    """Choose m points that hold all six directions of motion about equally.
+    """Choose m points that hold all directions of motion about equally.
 
     Gelfand, Ikemoto, Rusinkiewicz and Levoy, "Geometrically Stable Sampling for the ICP Algorithm",
     3DIM 2003: the directions are the eigenvectors of Σ v vᵀ over all points. The next point is the
     one with the largest ⟨v, x⟩² for the direction x whose sum over the chosen points is smallest.
+    Directions that no point holds, such as shifts along a floor, are left out: choices for them
+    would follow rounding errors.
 
     Args:
         rows: ``(N, 6)`` from ``plane_rows``.
@@ -56,7 +61,9 @@ def stable_places(rows: NDArray[np.float64], m: int) -> NDArray[np.int64]:
         ``(m,)`` places, in the order of choice; of equal points the lowest place.
     """
     covariance = np.einsum("ni,nj->ij", rows, rows)  # the same sum for any number of threads
-    directions = np.linalg.eigh(covariance)[1]
+    values, directions = np.linalg.eigh(covariance)
+    is_held = values >= HELD * values[-1]
+    directions = directions[:, is_held]
     projections = np.einsum("ni,ij->nj", rows, directions)
     squares = np.square(projections)
     orders = np.argsort(-squares.T, axis=1, kind="stable")
