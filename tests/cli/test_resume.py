@@ -66,6 +66,40 @@ def test_stopped_run_resumed_by_same_command_gives_same_weights(
     assert ended(tmp_path / "stopped" / "last") == unbroken
 
 
+GRADIENTS = [
+    "+callbacks.x._target_=lightning.pytorch.callbacks.GradientAccumulationScheduler",
+    "+callbacks.x.scheduling={1:2}",
+]
+AVERAGE = [
+    "+callbacks.x._target_=lightning.pytorch.callbacks.StochasticWeightAveraging",
+    "+callbacks.x.swa_lrs=0.01",
+    "+callbacks.x.swa_epoch_start=1",
+]
+
+
+@pytest.mark.filterwarnings("ignore:SWA is currently only supported every epoch")
+@pytest.mark.parametrize("callback", [GRADIENTS, AVERAGE], ids=["gradients", "average"])
+def test_what_a_callback_of_lightning_set_at_the_start_of_an_epoch_is_set_again(
+    callback, tmp_path, monkeypatch
+):
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    command = [*SHORT, "batch_size=2", *callback]
+    done([*command, "hydra.run.dir=unbroken"], tmp_path)
+
+    def stop_inside(experiment, outputs, batch, batch_idx):
+        if (experiment.current_epoch, batch_idx) == (1, 1):
+            signal.raise_signal(signal.SIGINT)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Experiment, "on_train_batch_end", stop_inside)
+        status, _, err = call([*command, "hydra.run.dir=stopped"], tmp_path)
+        assert status == 130, err
+
+    done([*command, "hydra.run.dir=resumed", "ckpt_path=stopped"], tmp_path)
+
+    assert ended(tmp_path / "resumed") == ended(tmp_path / "unbroken")
+
+
 def steps_before(place):
     """Return the steps that a run has finished when it is stopped at a place."""
     if place == "test":

@@ -145,6 +145,15 @@ def test_several_devices_may_be_a_number_a_list_or_auto(devices, several):
         check_multirun(cfg)
 
 
+def test_one_device_on_each_of_several_nodes_is_several_devices(monkeypatch):
+    cfg = compose(["trainer.devices=1", "+trainer.num_nodes=2"])
+    monkeypatch.setenv("RANK", "1")
+
+    assert is_distributed(cfg)
+    assert is_worker_rank(cfg)
+    assert not is_distributed(compose(["trainer.devices=1", "+trainer.num_nodes=1"]))
+
+
 @pytest.mark.parametrize("name", ["WORLD_SIZE", "SLURM_NTASKS"])
 def test_processes_of_a_launcher_are_known_by_their_number(name, monkeypatch):
     several = compose(["trainer=ddp", "trainer.devices=2"])

@@ -16,7 +16,10 @@ RANKS = ("RANK", "LOCAL_RANK", "NODE_RANK", "GROUP_RANK", "SLURM_PROCID")
 
 
 def is_distributed(cfg: DictConfig) -> bool:
-    """Return whether the settings request more than one device."""
+    """Return whether the settings request more than one device, on one node or on several."""
+    nodes = cfg.trainer.get("num_nodes")
+    if nodes not in (None, 1):
+        return True
     devices = cfg.trainer.get("devices")
     if OmegaConf.is_list(devices):
         return len(devices) != 1

@@ -1,6 +1,7 @@
 """Limits of settings: the values that one takes, in words and as a function."""
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -60,6 +61,19 @@ def _unlimited_or(minimum: int) -> Limits:
     return Limits(f"-1 or {numbers.allowed}", lambda x: x == -1 or numbers.fits(x))
 
 
+def _is_time(value: Any) -> bool:
+    """Return whether Lightning reads a value as days, hours, minutes and seconds, or as none."""
+    if isinstance(value, str):
+        return re.fullmatch(r"\d+:\d\d:\d\d:\d\d", value.strip()) is not None
+    return value is None or (isinstance(value, Mapping) and bool(value))
+
+
+def _starts_processes_by_a_command(value: Any) -> bool:
+    """Return whether a strategy is none of those that copy this process, and with it a run."""
+    copying = ("spawn", "fork", "notebook")
+    return not (isinstance(value, str) and any(name in value for name in copying))
+
+
 ABOVE_ZERO = number("above 0", lambda x: x > 0)
 
 _ELSEWHERE = {
@@ -72,7 +86,10 @@ TRAINER = {
     "max_epochs": _unlimited_or(0),
     # Lightning uses these only when training begins, after pretraining.
     "max_steps": _unlimited_or(1),
-    "max_time": Limits("null or a time, such as 00:08:00:00", lambda x: x is None or bool(x)),
+    "max_time": Limits("null or a time, such as 00:08:00:00", _is_time),
+    "strategy": Limits(
+        "one that starts processes by a command, such as ddp", _starts_processes_by_a_command
+    ),
     "gradient_clip_val": Limits(
         "null or a number above 0", lambda x: x is None or ABOVE_ZERO.fits(x)
     ),

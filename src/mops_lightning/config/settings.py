@@ -297,6 +297,7 @@ INSIDE: dict[str, dict[str, Any]] = {
         "limits": TRAINER["accumulate_grad_batches"],
     },
     "trainer.log_every_n_steps": {**_NOTHING, "limits": TRAINER["log_every_n_steps"]},
+    "trainer.strategy": {**_NOTHING, "limits": TRAINER["strategy"]},
     "trainer.limit_test_batches": {"affects": Affects.SCORES},
     "trainer.barebones": {"affects": Affects.SCORES},  # it has none
 }

@@ -10,6 +10,7 @@ from typing import Any
 
 import lightning as L
 import torch
+from lightning.pytorch.callbacks import GradientAccumulationScheduler, StochasticWeightAveraging
 from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
@@ -192,6 +193,8 @@ class Experiment(L.LightningModule):
         epochs: Any = self.trainer.fit_loop.epoch_progress.current
         if epochs.processed == epochs.ready:
             self.trainer.fit_loop.reset_restart_stage()
+        if self.trainer.fit_loop.restarted_mid_epoch:
+            self._begin_epoch_of_callbacks()
         loader: Any = self.trainer.train_dataloader
         if self.distillation is not None:
             self.distillation.start(loader, self.device, _dtype(self))
@@ -200,6 +203,16 @@ class Experiment(L.LightningModule):
             if position >= len(loader):
                 position = 0
             loader.load_state_dict({"epoch": self.current_epoch, "position": position})
+
+    def _begin_epoch_of_callbacks(self) -> None:
+        """Let callbacks of Lightning do again what they did at the start of the epoch.
+
+        These do not save it in the checkpoint, and may do it twice.
+        """
+        callbacks: Any = self.trainer  # its list of callbacks is not declared
+        for callback in callbacks.callbacks:
+            if isinstance(callback, GradientAccumulationScheduler | StochasticWeightAveraging):
+                callback.on_train_epoch_start(self.trainer, self)
 
     def on_train_epoch_start(self) -> None:
         """Tell the loader which epoch it is; the run may have been resumed."""

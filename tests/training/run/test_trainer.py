@@ -106,6 +106,12 @@ def test_make_trainer_refuses_half_precision_without_a_gpu(tmp_path):
         trainer_of(tmp_path, "trainer.precision=16-mixed")
 
 
+def test_synchronised_batchnorm_of_several_cpus_is_refused(tmp_path):
+    several = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"]
+    with pytest.raises(UserError, match=r"sync_batchnorm=true needs GPUs, and none was found"):
+        trainer_of(tmp_path, *several, "+trainer.sync_batchnorm=true")
+
+
 @pytest.mark.parametrize(
     ("settings", "has_path"),
     [

@@ -233,7 +233,7 @@ def _record_results(parts: Parts, record: RunRecord) -> None:
 def _check_scores(parts: Parts, metrics: Mapping[str, float]) -> None:
     """Refuse a test whose score or losses are not finite, though the weights are."""
     for name, value in metrics.items():
-        is_loss = name.split("/")[-2] == "loss"
+        is_loss = name.split("/")[-2:-1] == ["loss"]  # callbacks log names without a slash
         is_score = name == parts.experiment.score_name
         if math.isfinite(value) or not (is_loss or is_score):
             continue

@@ -110,6 +110,9 @@ def make_trainer(
             "trainer.precision=16-mixed needs a GPU, and none was found. Try trainer.precision="
             "bf16-mixed."
         )
+    is_on_cpus = trainer.strategy.root_device.type == "cpu"
+    if node.get("sync_batchnorm") and trainer.world_size > 1 and is_on_cpus:
+        raise UserError("trainer.sync_batchnorm=true needs GPUs, and none was found. Leave it out.")
     return trainer
 
 
