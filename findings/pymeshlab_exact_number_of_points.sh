@@ -2,7 +2,7 @@
 # PyMeshLab 2025.7 simplifies clouds to more points than asked for, with exactnumflag=True, too.
 #
 # With exactnumflag, both generate_sampling_poisson_disk and generate_simplified_point_cloud search
-# for the radius that gives the requested number of samples to 0.5 %. On a mesh they find it: 500
+# for the radius that gives the requested number of samples to 0.5 %. On a mesh it is found: 500
 # gives 501. On a cloud the search does nothing: 500 of 20,000 points on a sphere become about 800, and
 # of 20,000 points in a cube about 3,800, with the flag and without.
 #

@@ -8,7 +8,7 @@ import torch
 from mops_lightning.records import run_record
 from mops_lightning.training.experiment import Experiment
 from mops_lightning.zoo import weights
-from tests.support.command_line import TINY, call, done
+from tests.support.command_line import TINY, call, done, unbroken_and_resumed
 
 SHORT = [*TINY, "trainer.max_epochs=3", "weights=null", "baselines={}"]
 """Epochs of two steps; the default recipe, with a moving average of the weights."""
@@ -82,20 +82,12 @@ AVERAGE = [
 def test_what_a_callback_of_lightning_set_at_the_start_of_an_epoch_is_set_again(
     callback, tmp_path, monkeypatch
 ):
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    command = [*SHORT, "batch_size=2", *callback]
-    done([*command, "hydra.run.dir=unbroken"], tmp_path)
-
     def stop_inside(experiment, outputs, batch, batch_idx):
         if (experiment.current_epoch, batch_idx) == (1, 1):
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGTERM)
 
-    with monkeypatch.context() as patched:
-        patched.setattr(Experiment, "on_train_batch_end", stop_inside)
-        status, _, err = call([*command, "hydra.run.dir=stopped"], tmp_path)
-        assert status == 130, err
-
-    done([*command, "hydra.run.dir=resumed", "ckpt_path=stopped"], tmp_path)
+    command = [*SHORT, "batch_size=2", *callback]
+    unbroken_and_resumed(command, tmp_path, monkeypatch, "on_train_batch_end", stop_inside)
 
     assert ended(tmp_path / "resumed") == ended(tmp_path / "unbroken")
 

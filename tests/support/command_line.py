@@ -14,6 +14,7 @@ from hydra.core.global_hydra import GlobalHydra
 
 from mops_lightning.cli.main import main
 from mops_lightning.config.compose import compose
+from mops_lightning.training.experiment import Experiment
 from mops_lightning.training.run.run import run
 
 TINY_ANY_DATA = [
@@ -90,6 +91,19 @@ def done(arguments, folder):
     status, out, err = call(arguments, folder)
     assert status == 0, out + err
     return out
+
+
+def unbroken_and_resumed(arguments, folder, monkeypatch, hook, stop):
+    """Train without a break, and again with one stop, into the folders of these names.
+
+    ``stop`` takes the place of a hook of the experiment while the second training is stopped.
+    """
+    done([*arguments, "hydra.run.dir=unbroken"], folder)
+    with monkeypatch.context() as patched:
+        patched.setattr(Experiment, hook, stop)
+        status, _, err = call([*arguments, "hydra.run.dir=stopped"], folder)
+    assert status == 130, err
+    done([*arguments, "hydra.run.dir=resumed", "ckpt_path=stopped"], folder)
 
 
 def refused(arguments, folder):

@@ -19,7 +19,7 @@ from mops_lightning.training.recipe.distillation import Distillation, Targets
 from mops_lightning.training.recipe.recipe import Recipe
 from mops_lightning.types import Batch
 from mops_lightning.zoo import weights
-from tests.support.command_line import TINY, call, done, job
+from tests.support.command_line import TINY, job, unbroken_and_resumed
 
 
 def note_at_each_step(monkeypatch, what):
@@ -66,18 +66,13 @@ def test_state_of_the_optimizer_survives_a_stop(optimizer, tmp_path, monkeypatch
         f"optimizer={optimizer}",
         "trainer.max_epochs=3",
     ]
-    done([*arguments, "hydra.run.dir=unbroken"], tmp_path)
 
     def stop_in_fourth_step(self, _):
         if self.global_step == 3:
             signal.raise_signal(signal.SIGTERM)
 
-    with monkeypatch.context() as patched:
-        patched.setattr(Experiment, "on_before_zero_grad", stop_in_fourth_step)
-        status, _, err = call([*arguments, "hydra.run.dir=stopped"], tmp_path)
-    assert status == 130, err
-
-    done([*arguments, "hydra.run.dir=resumed", "ckpt_path=stopped"], tmp_path)
+    hook = "on_before_zero_grad"
+    unbroken_and_resumed(arguments, tmp_path, monkeypatch, hook, stop_in_fourth_step)
 
     unbroken = weights.read(tmp_path / "unbroken" / weights.FILE)
     resumed = weights.read(tmp_path / "resumed" / weights.FILE)

@@ -50,20 +50,20 @@ def build_report(folder: Path, metrics: Iterable[str] = (), mixed: bool = False)
     wanted = list(metrics)
     of_samplers = [record for record in found.done if record.config["learn"] != "task"]
     tables: list[Table] = []
+    shown, split = found.done, net_groups
     if of_samplers:
-        parts = groups(of_samplers, mixed)
-        joined = groups(of_samplers, mixed=True)
+        shown, split = of_samplers, groups
+    parts = split(shown, mixed)
+    if of_samplers:
         tables = _tables(parts, wanted, collect.tested_metrics(of_samplers))
         texts = [grid for table in tables for grid in grids(table)]
     else:
-        parts = net_groups(found.done, mixed)
-        joined = net_groups(found.done, mixed=True)
         texts = [nets_grid(part, wanted) for part in parts]
-    remarks = _about_runs(found, of_samplers or found.done, tables)
+    remarks = _about_runs(found, shown, tables)
     remarks += edited(found.done)
     if len(parts) > 1:
         apart = NOT_COMPARABLE.format(len(parts))
-        if len(joined) < len(parts):
+        if len(split(shown, mixed=True)) < len(parts):
             apart += MIXED_JOINS
         remarks += ["", apart]
     remarks += without_result(found)

@@ -209,8 +209,8 @@ class Experiment(L.LightningModule):
 
         These do not save it in the checkpoint, and may do it twice.
         """
-        callbacks: Any = self.trainer  # its list of callbacks is not declared
-        for callback in callbacks.callbacks:
+        trainer: Any = self.trainer  # its callbacks are not declared
+        for callback in trainer.callbacks:
             if isinstance(callback, GradientAccumulationScheduler | StochasticWeightAveraging):
                 callback.on_train_epoch_start(self.trainer, self)
 

@@ -60,22 +60,22 @@ def task_weights(cfg: DictConfig, dataset: CloudDataset, run_folder: Path) -> Pa
             "processes. Run the same command once with learn=task trainer=auto and without "
             "the launcher, or give weights=FILE."
         )
-    if shortening(_plain(cfg)):
+    shortened = shortening(_plain(cfg))
+    if shortened:
         folder = run_folder / SHORTENED
-        _train(cfg, folder, dataset)
+        _train(cfg, folder, dataset, shortened)
     else:
         with _lock(folder, cfg.names.net):
             if not (folder / FILE).is_file():  # otherwise another process trained it meanwhile
-                _train(cfg, folder, dataset)
+                _train(cfg, folder, dataset, shortened)
     return folder / FILE
 
 
-def _train(cfg: DictConfig, folder: Path, dataset: CloudDataset) -> None:
+def _train(cfg: DictConfig, folder: Path, dataset: CloudDataset, shortened: list[str]) -> None:
     """Train the task net of a run in a folder, or resume its interrupted training there."""
     epochs = f"{cfg.epochs.task} epochs"
     if cfg.epochs.task == 1:
         epochs = "1 epoch"
-    shortened = shortening(_plain(cfg))
     if shortened:
         epochs += f", shortened by {', '.join(shortened)}"
     print(
